@@ -187,12 +187,12 @@ def finetune(job: Job) -> Repeat:
     return update
 
 
-def pretrain(job: Job) -> Repeat:
+def train_policy(job: Job) -> Repeat:
     """A pre-training update: tokens, forward, loss, backward, clipping, AdamW."""
     import torch
     from torch.nn.functional import cross_entropy
 
-    from rlftsim.training.pretrain import PretrainConfig
+    from rlftsim.training.imitation import PretrainConfig
 
     policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), PretrainConfig()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -215,7 +215,7 @@ def catk(job: Job) -> Repeat:
     from torch.nn.functional import cross_entropy
 
     from rlftsim.training.catk import CatkConfig, roll_out_closest  # where older versions have it, too
-    from rlftsim.training.closed_loop import predict_along
+    from rlftsim.training.closed_loop import predict_targets
     from rlftsim.training.freezing import freeze_untrained
 
     policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), CatkConfig()
@@ -228,7 +228,7 @@ def catk(job: Job) -> Repeat:
         batch = fresh(scenarios, job.device)
         context = policy.encode(batch)
         targeted = roll_out_closest(policy, batch, num_candidates=config.num_candidates, context=context)
-        predicted = predict_along(policy, context, targeted, trained(batch))
+        predicted = predict_targets(policy, context, targeted, trained(batch))
         logits, target = predicted.logits[predicted.target_mask], predicted.target[predicted.target_mask]
         cross_entropy(logits, target, label_smoothing=config.label_smoothing).backward()
         torch.nn.utils.clip_grad_norm_(weights, config.gradient_clip)
@@ -247,7 +247,7 @@ def near_scenarios(job: Job) -> list[Any]:
 def trained(batch: Any) -> Any:
     """Agents that count in an update."""
     from rlftsim.training.data import trained_agents
-    from rlftsim.training.pretrain import PretrainConfig
+    from rlftsim.training.imitation import PretrainConfig
 
     config = PretrainConfig()
     return trained_agents(batch, 0, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed)
@@ -369,16 +369,16 @@ def prepare_base(job: Job) -> None:
     """The demo's vocabulary and base model, as `rlftsim demo` makes them."""
     import torch
 
-    from rlftsim.experiments.stages import find_vocabulary, open_training
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.recipes.smart import smart_demo_rlftsim
+    from rlftsim.recipes.train import find_vocabulary, open_training
     from rlftsim.scenario.synthetic import pack_path
-    from rlftsim.training.pretrain import pretrain
+    from rlftsim.training.run import train_policy
 
     recipe, training, out = smart_demo_rlftsim(), open_training(pack_path()), Path(job.inputs) / "base"
     vocabulary = find_vocabulary(training, recipe.tokens, out / "vocabulary.safetensors", origin="benchmarks/speed.py")
     torch.manual_seed(recipe.pretrain.seed)
-    pretrain(SmartPolicy(recipe.model, vocabulary), training, out, recipe.pretrain)
+    train_policy(SmartPolicy(recipe.model, vocabulary), training, out, recipe.pretrain)
 
 
 def prepare_evaluated(job: Job) -> None:

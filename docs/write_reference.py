@@ -25,7 +25,7 @@ from rlftsim.cli.mistakes import ACTIONS
 from rlftsim.cli.plugins import POINTS
 from rlftsim.plugins import is_ours
 from rlftsim.recipes.registry import RECIPES
-from rlftsim.recipes.settings import field_documentation, sections_of, summary_of
+from rlftsim.recipes.settings import field_documentation, list_sections, summarize_docstring
 from rlftsim.training.run_folder import to_plain
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -126,7 +126,7 @@ def plain(text: str) -> str:
 
 def fields_page() -> str:
     """Every setting of every recipe section, with its value in the recipes, and other configurations."""
-    recipes = {name: sections_of(RECIPES.get(name)()) for name in ("smart-tiny", "smart-demo", "trafficbots")}
+    recipes = {name: list_sections(RECIPES.get(name)()) for name in ("smart-tiny", "smart-demo", "trafficbots")}
     lines = [
         "# Settings", "",
         "Every setting of a recipe is a flag, `--finetune.learning-rate 1e-5`, and a key of `config.json`.",
@@ -134,7 +134,8 @@ def fields_page() -> str:
     ]  # fmt: skip
     for section in dict.fromkeys(name for sections in recipes.values() for name in sections):
         owners = [sections.get(section) for sections in recipes.values()]
-        lines += [f"## {section}", "", f"{plain(summary_of(type(next(o for o in owners if o is not None))))}", ""]
+        summary = summarize_docstring(type(next(o for o in owners if o is not None)))
+        lines += [f"## {section}", "", f"{plain(summary)}", ""]
         lines += [f"| setting | {' | '.join(f'`{name}`' for name in recipes)} | meaning |", "|---|---|---|---|---|"]
         columns = [dict(settings_of(owner)) if owner is not None else {} for owner in owners]
         for name in dict.fromkeys(name for column in columns for name in column):

@@ -1,10 +1,10 @@
 """The loss of a CAT-K update, by itself."""
 
-from rlftsim.training.closed_loop import predict_along
+from rlftsim.training.closed_loop import predict_targets
 from rlftsim.training.imitation import summed_loss
 
 
 def catk_loss(policy, batch, targeted, trained):
     """Mean cross-entropy of the targets along CAT-K rollouts, nats; 0 where nothing counts. Differentiable."""
-    summed = summed_loss(predict_along(policy, policy.encode(batch), targeted, trained), 0.0)
+    summed = summed_loss(predict_targets(policy, policy.encode(batch), targeted, trained), 0.0)
     return summed.loss / summed.count.clamp(min=1)

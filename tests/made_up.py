@@ -9,8 +9,8 @@ from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.parallel import DeviceConfig
-from rlftsim.training.pretrain import PretrainConfig
 
 CPU = DeviceConfig(accelerator="cpu", threads=1)
 TINY = SmartRecipe(

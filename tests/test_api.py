@@ -32,8 +32,8 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.parallel import DeviceConfig
-from rlftsim.training.pretrain import PretrainConfig
 
 NAMES = [
     *("Scenario", "load_dataset", "write_dataset"),

@@ -16,12 +16,12 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.training.alarms import AlarmConfig
-from rlftsim.training.catk import CatkConfig, RoadConfig, catk_finetune
-from rlftsim.training.finetune import finetune
+from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.parallel import DeviceConfig, is_first_process
-from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.reference import KlConfig
+from rlftsim.training.run import train_policy
 from rlftsim.training.validation import ValidationConfig
 
 NUM_SCENARIOS = 5
@@ -89,11 +89,13 @@ def gradients_of(policy):
 def train(stage, policy, scenarios, out, held_out=None, **changes):
     """Run a stage with other values for some of its fields."""
     if stage == "pretrain":
-        return pretrain(policy, scenarios, out, replace(PRETRAIN, **changes), held_out=held_out)
+        return train_policy(policy, scenarios, out, replace(PRETRAIN, **changes), held_out=held_out)
     if stage in ("catk", "road"):
         config = CATK if stage == "catk" else ROAD
-        return catk_finetune(policy, scenarios, out, replace(config, **changes), held_out=held_out)
-    return finetune(policy, scenarios, out, replace(OF_EVERYTHING if stage == "everything" else FINETUNE, **changes))
+        return train_policy(policy, scenarios, out, replace(config, **changes), held_out=held_out)
+    return train_policy(
+        policy, scenarios, out, replace(OF_EVERYTHING if stage == "everything" else FINETUNE, **changes)
+    )
 
 
 def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=None):

@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.recipes.settings import recipe_as_json, recipe_as_text, sections_of
+from rlftsim.recipes.settings import list_sections, recipe_as_json, recipe_as_text
 from rlftsim.scenario.open import open_dataset
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.training.run_folder import flatten, to_plain
@@ -201,7 +201,7 @@ def test_the_text_of_a_recipe_has_every_field_and_its_documentation():
     for name in flatten(to_plain(recipe)):
         assert f"  {name.rpartition('.')[2]}: " in text
     assert "# Rollouts per scenario and update (N).\n  num_rollouts: 4" in text
-    assert list(json.loads(recipe_as_json(recipe))) == list(sections_of(recipe))
+    assert list(json.loads(recipe_as_json(recipe))) == list(list_sections(recipe))
 
 
 def test_recipes_are_listed_with_a_summary_each(capsys):

@@ -14,15 +14,15 @@ from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.evaluate import EvaluateConfig
-from rlftsim.experiments import stages, tables
+from rlftsim.experiments import tables
 from rlftsim.experiments.demo import DemoConfig, run_demo
 from rlftsim.experiments.model_specs import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.paper import qualitative, variance_scaling
 from rlftsim.experiments.results import Experiment, ExperimentResult, run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.recipes import train as training
 from rlftsim.recipes.base import Recipe
 from rlftsim.scenario.dataset import write_dataset
-from rlftsim.training import methods
 
 QUICK = EvaluateConfig(num_rollouts=4)
 ROWS = {"base": (BASE,), "MLOO": over_seeds(FineTuned("mloo"), 1), "oracle": (ORACLE,)}
@@ -75,17 +75,17 @@ def test_an_interrupted_experiment_does_what_is_missing(done, data, tmp_path, mo
     """Killed while the third spec was trained: the first two stay as they are."""
     rows = {"base": (BASE,), "MLOO": over_seeds(FineTuned("mloo"), 1), "RLOO": (FineTuned("rloo"),)}
     suite = ExperimentSuite(TINY, data, tmp_path, QUICK)
-    true_finetune = methods.finetune
+    true_training = training.train_policy
 
     def killed(policy, scenarios, out, config, **rest):
-        if config.reward == "rloo":
+        if getattr(config, "reward", None) == "rloo":
             raise KeyboardInterrupt
-        return true_finetune(policy, scenarios, out, config, **rest)
+        return true_training(policy, scenarios, out, config, **rest)
 
-    monkeypatch.setattr(methods, "finetune", killed)
+    monkeypatch.setattr(training, "train_policy", killed)
     with pytest.raises(KeyboardInterrupt):
         suite.evaluate(rows)
-    monkeypatch.setattr(methods, "finetune", true_finetune)
+    monkeypatch.setattr(training, "train_policy", true_training)
     before = stamps(tmp_path)
     measured = suite.evaluate(rows)
     assert {path: stamp for path, stamp in stamps(tmp_path).items() if path in before} == before
@@ -145,7 +145,7 @@ def test_a_longer_run_goes_on_from_a_shorter_one_to_the_same_weights(done):
     assert [line["update"] for line in steps] == [1, 2]
     alone = done.out / "alone"
     config = replace(TINY.finetune, seed=1)
-    stages.finetune_model(done.base(), done.training, config, alone)
+    training.finetune_model(done.base(), done.training, config, alone)
     expected, found = (load_file(f / "model" / "model.safetensors") for f in (alone, done.model_folder(whole)))
     for name, values in expected.items():
         torch.testing.assert_close(found[name], values, rtol=0, atol=0)

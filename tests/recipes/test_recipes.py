@@ -14,7 +14,7 @@ from rlftsim.recipes import smart, trafficbots
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.card import model_card
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.recipes.settings import sections_of
+from rlftsim.recipes.settings import list_sections
 from rlftsim.recipes.smart import SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
 from rlftsim.recipes.trafficbots import TrafficBotsRecipe
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -58,7 +58,7 @@ class TinyRecipe(Recipe):
 
 def test_a_recipe_may_have_no_vocabulary_and_no_sizes():
     recipe = TinyRecipe()
-    assert list(sections_of(recipe)) == ["pretrain", "finetune", "catk", "gcsl"]
+    assert list(list_sections(recipe)) == ["pretrain", "finetune", "catk", "gcsl"]
     with pytest.raises(ConfigError, match="TinyRecipe describes no new policy"):
         recipe.new_policy(None)
     assert recipe.with_goals().finetune.goals.probability == 1
@@ -83,7 +83,7 @@ class ContinuousRecipe(Recipe):
 
 def test_a_recipe_may_leave_methods_out_and_bring_sections():
     recipe = ContinuousRecipe()
-    assert list(sections_of(recipe)) == ["pretrain", "finetune", "prior"]
+    assert list(list_sections(recipe)) == ["pretrain", "finetune", "prior"]
     with_goals = recipe.with_goals()
     assert with_goals.catk is None
     assert "goal(" in with_goals.finetune.reward

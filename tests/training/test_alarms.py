@@ -14,7 +14,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training.alarms import DRIFT_MONITORS, AlarmConfig, Alarms
 from rlftsim.training.experience import compute_diversity, compute_speed_gap
-from rlftsim.training.finetune import finetune
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 CONFIG = AlarmConfig(first_updates=4, window=5)
@@ -117,7 +117,7 @@ def test_thresholds_are_positive(name):
 def test_a_run_logs_an_alarm_once_and_goes_on(vocabulary, drawn_scenarios, tmp_path, capsys):
     touchy = AlarmConfig(first_updates=1, window=1, speed_drift_mps=1e-9)
     config = replace(tiny.FINETUNE, epochs=1.0, alarms=touchy)  # four updates on four scenarios: speeds differ
-    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     lines = read_metrics(tmp_path)
     assert len(lines) == 4
     assert lines[0]["alarm_speed"] == 0

@@ -14,14 +14,14 @@ from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.batches import balance_by_cost, micro_batches, refuse_unscored, scenario_costs
+from rlftsim.training.batches import balance_by_cost, check_scored, micro_batches, scenario_costs
 
 COSTS = st.lists(st.floats(0.1, 100.0), min_size=1, max_size=24)
 
 
-@given(costs=COSTS, num_parts=st.integers(1, 6))
-def test_parts_hold_everything_once_and_cost_about_the_same(costs, num_parts):
-    parts = balance_by_cost(costs, num_parts)
+@given(costs=COSTS, num_groups=st.integers(1, 6))
+def test_parts_hold_everything_once_and_cost_about_the_same(costs, num_groups):
+    parts = balance_by_cost(costs, num_groups)
     assert sorted(i for share in parts for i in share) == list(range(len(costs)))
     spent = [sum(costs[i] for i in share) for share in parts]
     assert max(spent) - min(spent) <= max(costs) + 1e-6  # less than the most expensive scenario
@@ -64,9 +64,9 @@ def test_scenarios_without_a_reward_are_refused_before_a_run_begins(vocabulary, 
     valid = tracks.valid.copy()
     valid[sound.evaluated_indices, CURRENT_STEP] = False
     alone = replace(sound, scenario_id="alone", tracks=replace(tracks, valid=valid))
-    refuse_unscored([sound])
+    check_scored([sound])
     with pytest.raises(DataError, match=r"scenario alone has no evaluated agent: .* and 0 others of 2"):
-        refuse_unscored([sound, alone])
+        check_scored([sound, alone])
     write_dataset([sound, alone], tmp_path / "data", split="training")
     data = ScenarioDataset(tmp_path / "data", "training")
     with pytest.raises(DataError, match=r"scenario alone has no evaluated agent"):
@@ -91,4 +91,4 @@ def test_a_run_may_go_on_with_a_smaller_budget(vocabulary, drawn_scenarios, tmp_
     config = {"epochs": 0.5, "batch_size": 2}
     tiny.train("pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, **config)
     smaller = replace(tiny.PRETRAIN, **config, micro_batch_size=1, micro_batch_cost=0.5)
-    tiny.pretrain(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, smaller)
+    tiny.train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, smaller)

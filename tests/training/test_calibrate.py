@@ -12,9 +12,10 @@ import tiny
 from rlftsim.errors import ConfigError
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.training.calibrate import FEATURES, CalibrateConfig, CalibrationLearner, calibrate
-from rlftsim.training.constraints import CONSTRAINTS, Constraint, against_others
+from rlftsim.training.calibrate import FEATURES, CalibrateConfig, CalibrationLearner
+from rlftsim.training.constraints import CONSTRAINTS, Constraint, subtract_baseline
 from rlftsim.training.natural_step import best_length, natural_direction, t_value
+from rlftsim.training.run import train_policy
 
 CONFIG = CalibrateConfig(
     num_rollouts=3, batch_size=2, micro_batch_size=1, checkpoint_every=1, lengths=(1.0,), max_kl=1.0, device=tiny.CPU
@@ -71,7 +72,7 @@ def test_the_credit_of_mloo_against_the_others_estimates_the_gain_of_the_whole_g
         values = VALUES[0, group]
         without = (values.sum() - values) / 2
         mloo = (without.mean() - without)[None, :, None]  # as rewards.mloo
-        gradient += float(p[group].prod() * (against_others(mloo)[0, :, 0] * score[group]).sum())
+        gradient += float(p[group].prod() * (subtract_baseline(mloo)[0, :, 0] * score[group]).sum())
     # without one of N the mean moves by 1 / (N - 1) in place of 1 / N
     assert gradient == pytest.approx(3 / 2 * (expected(1e-4) - expected(-1e-4)) / 2e-4, rel=1e-5)
 
@@ -131,7 +132,7 @@ def test_a_t_value_is_the_mean_over_its_standard_error():
 
 
 def test_a_calibration_says_what_each_feature_weighs_and_earns(policy, drawn_scenarios, tmp_path):
-    model = calibrate(policy, drawn_scenarios, tmp_path, CONFIG, card="made by a test")
+    model = train_policy(policy, drawn_scenarios, tmp_path, CONFIG, card="made by a test")
     stored = json.loads((model / "calibration.json").read_text())
     assert [row["feature"] for row in stored["features"]] == list(FEATURES)
     assert [row["eta"] for row in stored["features"]] == pytest.approx(policy.eta.tolist())
@@ -145,13 +146,13 @@ def test_a_calibration_says_what_each_feature_weighs_and_earns(policy, drawn_sce
 
 def test_weights_of_the_network_stay_as_they_are(policy, drawn_scenarios, tmp_path):
     before = fingerprint_policy(policy.base)
-    calibrate(policy, drawn_scenarios, tmp_path, CONFIG)
+    train_policy(policy, drawn_scenarios, tmp_path, CONFIG)
     assert fingerprint_policy(policy.base) == before
 
 
 def test_a_run_that_was_stopped_ends_with_the_same_weights(policy, vocabulary, drawn_scenarios, tmp_path, monkeypatch):
-    calibrate(policy, drawn_scenarios, tmp_path / "whole", CONFIG)
-    original, calls = CalibrationLearner.work, []
+    train_policy(policy, drawn_scenarios, tmp_path / "whole", CONFIG)
+    original, calls = CalibrationLearner.measure, []
 
     def interrupted(learner, fabric):
         calls.append(1)
@@ -162,10 +163,10 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights(policy, vocabulary, d
     def fresh():
         return CalibratedPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
 
-    monkeypatch.setattr(CalibrationLearner, "work", interrupted)
+    monkeypatch.setattr(CalibrationLearner, "measure", interrupted)
     with pytest.raises(KeyboardInterrupt, match="behind update 2"):
-        calibrate(fresh(), drawn_scenarios, tmp_path / "stopped", CONFIG)
-    calibrate(fresh(), drawn_scenarios, tmp_path / "stopped", CONFIG)
+        train_policy(fresh(), drawn_scenarios, tmp_path / "stopped", CONFIG)
+    train_policy(fresh(), drawn_scenarios, tmp_path / "stopped", CONFIG)
     whole, stopped = (measured_in(tmp_path / name) for name in ("whole", "stopped"))
     assert all(torch.equal(whole[name], stopped[name]) for name in whole)
     assert whole["gradients"].any()
@@ -183,7 +184,7 @@ def test_processes_change_no_gradient(vocabulary, drawn_scenarios, tmp_path):
         learner = CalibratedPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
         device = tiny.replace(tiny.CPU, processes=processes)
         out = tmp_path / str(processes)
-        calibrate(learner, drawn_scenarios, out, tiny.replace(CONFIG, device=device))
+        train_policy(learner, drawn_scenarios, out, tiny.replace(CONFIG, device=device))
         measured.append(measured_in(out))
     assert torch.equal(*(one["gradients"] for one in measured))
     torch.testing.assert_close(*(one["fisher"] for one in measured), rtol=1e-12, atol=0)
@@ -191,7 +192,7 @@ def test_processes_change_no_gradient(vocabulary, drawn_scenarios, tmp_path):
 
 def test_the_policy_must_have_the_features_of_the_settings(policy, drawn_scenarios, tmp_path):
     with pytest.raises(ConfigError, match="make it with CalibratedPolicy"):
-        calibrate(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, features=("speed_slow",)))
+        train_policy(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, features=("speed_slow",)))
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.catk import CatkConfig, catk_finetune
+from rlftsim.training.catk import CatkConfig
 from rlftsim.training.catk_rollouts import roll_out_closest
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 ENDS = slice(4, None, 5)
@@ -133,7 +134,7 @@ def test_a_few_updates_lower_the_closed_loop_loss(vocabulary, drawn_scenarios, b
 
     before, frozen = loss(), policy.network.map_encoder.token.state_dict()
     frozen = {name: value.clone() for name, value in frozen.items()}
-    catk_finetune(policy, drawn_scenarios, tmp_path, replace(tiny.CATK, epochs=10.0, batch_size=4, learning_rate=1e-2))
+    train_policy(policy, drawn_scenarios, tmp_path, replace(tiny.CATK, epochs=10.0, batch_size=4, learning_rate=1e-2))
     assert loss() < 0.7 * before
     assert all(
         torch.equal(frozen[name], value) for name, value in policy.network.map_encoder.token.state_dict().items()
@@ -173,7 +174,7 @@ def test_half_precision_moves_the_loss_by_less_than_two_percent(stage, vocabular
 
 def test_what_cannot_be_fine_tuned_is_refused(vocabulary, drawn_scenarios, tmp_path):
     with pytest.raises(ConfigError, match="ConstantVelocity has no weights"):
-        catk_finetune(ConstantVelocity(), drawn_scenarios, tmp_path, tiny.CATK)
+        train_policy(ConstantVelocity(), drawn_scenarios, tmp_path, tiny.CATK)
     with pytest.raises(ConfigError, match="num_candidates must be positive"):
         CatkConfig(num_candidates=0)
     with pytest.raises(ConfigError, match="max_distance_lengths must be positive"):

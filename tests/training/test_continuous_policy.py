@@ -11,7 +11,7 @@ from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.rollout.policy import ImitatedPolicy, ImitationLoss
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.pretrain import pretrain
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 
@@ -52,7 +52,7 @@ def glided(drawn_scenarios, tmp_path_factory):
     out = tmp_path_factory.mktemp("glide")
     torch.manual_seed(0)
     policy = Glide()
-    pretrain(policy, drawn_scenarios, out, CONFIG)
+    train_policy(policy, drawn_scenarios, out, CONFIG)
     return policy, out
 
 
@@ -81,7 +81,7 @@ def test_the_loss_does_not_depend_on_how_many_scenarios_are_in_memory(drawn_scen
     for size in (1, 2):
         torch.manual_seed(0)
         config = replace(CONFIG, epochs=1.0, micro_batch_size=size)
-        pretrain(Glide(), drawn_scenarios, tmp_path / str(size), config)
+        train_policy(Glide(), drawn_scenarios, tmp_path / str(size), config)
         losses.append([line["loss"] for line in read_metrics(tmp_path / str(size))])
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
 
@@ -98,7 +98,7 @@ def test_a_count_that_adds_up_to_less_than_one_divides_all_the_same(drawn_scenar
     found = []
     for kind in (Glide, Light):
         torch.manual_seed(0)
-        pretrain(kind(), drawn_scenarios, tmp_path / kind.__name__, replace(CONFIG, epochs=1.0, gradient_clip=1e9))
+        train_policy(kind(), drawn_scenarios, tmp_path / kind.__name__, replace(CONFIG, epochs=1.0, gradient_clip=1e9))
         lines = read_metrics(tmp_path / kind.__name__)
         found.append([line[name] for line in lines for name in ("loss", "error_m", "gradient_norm")])
     assert found[0] == pytest.approx(found[1], rel=1e-3)

@@ -20,11 +20,12 @@ from rlftsim.scenario.batch import collate
 from rlftsim.training import experience
 from rlftsim.training import finetune as module
 from rlftsim.training.data import trained_agents
-from rlftsim.training.finetune import compute_reward, finetune, prepare, update_policy
+from rlftsim.training.finetune import compute_reward, prepare, update_policy
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import masked_sum
 from rlftsim.training.reference import KlConfig
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 CONFIG = replace(tiny.FINETUNE, num_rollouts=4, gradient_clip=1e9)
@@ -94,7 +95,7 @@ def test_a_run_says_how_many_weights_it_trains(vocabulary, drawn_scenarios, tmp_
     policy = tiny.tiny_policy(vocabulary)
     total = sum(value.numel() for value in policy.parameters())
     head = sum(value.numel() for value in policy.network.decoder.head.parameters())
-    finetune(policy, drawn_scenarios, tmp_path, replace(tiny.FINETUNE, trained="head"))
+    train_policy(policy, drawn_scenarios, tmp_path, replace(tiny.FINETUNE, trained="head"))
     assert f" updates of {head:,} of {total:,} weights.\n" in capsys.readouterr().err
 
 
@@ -344,7 +345,7 @@ def test_a_run_that_diverges_stops_and_names_its_last_good_checkpoint(
     poison_from(monkeypatch, 4)  # three good updates, a checkpoint after the second
     config = replace(tiny.FINETUNE, epochs=1.5, max_skipped_in_a_row=3)
     with pytest.raises(CheckpointError, match=r"3 updates in a row .*update-00000002.*learning_rate"):
-        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+        train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert [line["skipped"] for line in read_metrics(tmp_path)] == [0, 0, 0, 1, 2, 3]
     warnings = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
     assert warnings == [
@@ -352,14 +353,14 @@ def test_a_run_that_diverges_stops_and_names_its_last_good_checkpoint(
     ]
     assert not (tmp_path / "model").exists()
     monkeypatch.undo()  # and it goes on from there once the cause is gone
-    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert (tmp_path / "model" / "config.json").exists()
 
 
 def test_a_run_whose_kl_exploded_says_so_and_stops(vocabulary, drawn_scenarios, tmp_path, capsys):
     config = replace(tiny.FINETUNE, epochs=5.0, max_kl=1e-9, max_skipped_in_a_row=2)
     with pytest.raises(CheckpointError, match=r"2 updates in a row .*KL above max_kl"):
-        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+        train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     warnings = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
     assert "nats per decision is above max_kl=1e-09 (1 in a row, the run stops at 2)" in warnings[0]
 
@@ -368,7 +369,7 @@ def test_a_short_run_that_skipped_every_update_has_not_succeeded(vocabulary, dra
     poison_from(monkeypatch, 1)
     config = replace(tiny.FINETUNE, epochs=0.5, max_skipped_in_a_row=5)  # two updates
     with pytest.raises(CheckpointError, match="2 updates in a row were skipped"):
-        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+        train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert not (tmp_path / "model").exists()
 
 
@@ -429,7 +430,7 @@ def test_a_policy_without_a_pretraining_loss_has_no_imitation_term(drawn_scenari
             raise AssertionError("refused before anything is saved")
 
     with pytest.raises(ConfigError, match="it has no teacher_forced and no imitation_loss"):
-        finetune(Learned(), drawn_scenarios, tmp_path, replace(tiny.FINETUNE, imitation_weight=0.1))
+        train_policy(Learned(), drawn_scenarios, tmp_path, replace(tiny.FINETUNE, imitation_weight=0.1))
 
 
 def test_gradients_are_clipped_and_weights_decay(learner, batch, fabric, reward_of):
@@ -448,7 +449,7 @@ def test_gradients_are_clipped_and_weights_decay(learner, batch, fabric, reward_
 
 def test_beta_of_a_run_follows_its_closed_form(vocabulary, drawn_scenarios, tmp_path):
     config = replace(tiny.FINETUNE, epochs=1.5, kl=KlConfig(target=2e-4, horizon=2.0))
-    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     lines, beta = read_metrics(tmp_path), 0.1
     for line in lines:
         assert line["beta"] == pytest.approx(beta, rel=1e-12)
@@ -465,7 +466,7 @@ def test_the_learning_rate_warms_up(learner, batch, fabric):
 
 def test_a_run_leaves_what_docs_training_promises(vocabulary, drawn_scenarios, tmp_path):
     config = replace(tiny.FINETUNE, epochs=0.5)
-    model = finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config, card="a card\n")
+    model = train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config, card="a card\n")
     assert model == tmp_path / "model"
     assert {p.name for p in model.iterdir()} == {
         "config.json", "model.safetensors", "vocabulary.safetensors", "README.md",
@@ -479,7 +480,7 @@ def test_a_run_leaves_what_docs_training_promises(vocabulary, drawn_scenarios, t
 
 def test_a_policy_without_weights_is_refused(drawn_scenarios, tmp_path):
     with pytest.raises(ConfigError, match="ConstantVelocity has no weights"):
-        finetune(ConstantVelocity(), drawn_scenarios, tmp_path, tiny.FINETUNE)
+        train_policy(ConstantVelocity(), drawn_scenarios, tmp_path, tiny.FINETUNE)
 
 
 def test_parts_that_a_policy_does_not_have_are_refused_before_the_folder_is_claimed(
@@ -487,14 +488,14 @@ def test_parts_that_a_policy_does_not_have_are_refused_before_the_folder_is_clai
 ):
     policy = tiny.tiny_policy(vocabulary)
     with pytest.raises(ConfigError, match="trained=goals, but"):
-        finetune(policy, drawn_scenarios, tmp_path / "run", replace(tiny.FINETUNE, trained="goals"))
+        train_policy(policy, drawn_scenarios, tmp_path / "run", replace(tiny.FINETUNE, trained="goals"))
     assert not (tmp_path / "run").exists()
 
 
 def test_a_run_says_that_its_first_update_has_no_reward(vocabulary, drawn_scenarios, tmp_path, capsys, reward_of):
     reward = reward_of(lambda realism, rollouts, batch: realism.single_meta_metric * torch.nan)
     config = replace(tiny.FINETUNE, reward=reward, epochs=1e-3)
-    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert "update 1, no reward reached a trained weight" in capsys.readouterr().err
 
 
@@ -511,7 +512,7 @@ def test_a_reward_that_is_no_number_is_said_once_and_counted(
         tiny.FINETUNE, reward=f"mloo + {reward_of(broken)}", batch_size=2, epochs=2.0,
         device=replace(tiny.CPU, processes=processes),
     )  # fmt: skip
-    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path, config)
     lines = [line for line in capsys.readouterr().err.splitlines() if "not finite" in line]
     assert lines == ["update 1, reward test_0: not finite in 1 of 2 scenarios, counted as 0"]
     logged = read_metrics(tmp_path)
@@ -522,7 +523,7 @@ def test_more_epochs_continue_a_run_that_has_ended(vocabulary, drawn_scenarios, 
     def train(epochs, out):
         torch.manual_seed(0)
         config = replace(tiny.FINETUNE, epochs=epochs)
-        return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
+        return train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
     model = train(1.0, "grown")
     short, weights = read_metrics(tmp_path / "grown"), (model / "model.safetensors").read_bytes()
@@ -546,7 +547,7 @@ def test_a_run_that_is_made_longer_and_stopped_stays_the_shorter_one(
         config = replace(tiny.FINETUNE, epochs=epochs, checkpoint_every=1)
         with monkeypatch.context() as patch:
             patch.setattr("rlftsim.training.finetune.update_policy", stop)
-            return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
+            return train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
     def weights(model):
         return (model / "model.safetensors").read_bytes()
@@ -574,7 +575,7 @@ def test_a_run_that_was_stopped_may_be_made_longer_before_it_has_ended(
     def train(epochs, out="run"):
         torch.manual_seed(0)
         config = replace(tiny.FINETUNE, epochs=epochs, checkpoint_every=1)
-        return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
+        return train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
     def stop(learner, *rest):
         if learner.update == 1:
@@ -596,7 +597,7 @@ def test_a_run_that_was_stopped_may_be_made_longer_before_it_has_ended(
 
 def test_no_scenario_is_refused(vocabulary, tmp_path):
     with pytest.raises(ConfigError, match="no scenario to train on"):
-        finetune(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.FINETUNE)
+        train_policy(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.FINETUNE)
 
 
 @pytest.mark.parametrize(

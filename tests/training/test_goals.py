@@ -25,16 +25,16 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.training import hindsight
 from rlftsim.training.augment import AugmentConfig, augment_goals
-from rlftsim.training.catk import catk_finetune
 from rlftsim.training.experience import Experience
-from rlftsim.training.finetune import compute_reward, finetune, prepare, update_policy
+from rlftsim.training.finetune import compute_reward, prepare, update_policy
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.freezing import freeze_untrained
-from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune, relabel_with_endpoints
+from rlftsim.training.goal_relabeling import GcslConfig, relabel_with_endpoints
 from rlftsim.training.goals import GoalConfig, choose_goals
 from rlftsim.training.hindsight import importance_ratio, met_goals, relabel_with_hindsight
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import agent_log_prob
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig
 
@@ -214,7 +214,7 @@ def test_the_goal_encoder_may_learn_faster(policy, fabric):
 
 def test_a_goal_free_model_is_not_trained_with_goals(vocabulary, drawn_scenarios, tmp_path):
     with pytest.raises(ConfigError, match="not goal-conditioned: add --goal concat or --goal indication"):
-        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, CONFIG)
+        train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, CONFIG)
 
 
 # ---- hindsight -----------------------------------------------------------------------------------------------------
@@ -386,7 +386,7 @@ def test_a_run_with_goals_of_all_kinds(policy, drawn_scenarios, tmp_path):
     augment_goals(policy, drawn_scenarios, tmp_path / "goals", AugmentConfig(num_rollouts=2, top_k=8))
     goals = GoalConfig(probability=0.7, augmented=str(tmp_path / "goals"), hindsight=0.5, learning_rate_scale=3.0)
     config = replace(CONFIG, goals=goals, epochs=0.75, credit="agent", micro_batch_size=1)
-    model = finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
+    model = train_policy(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
     metrics = read_metrics(tmp_path / "run")
     assert len(metrics) == 3
     assert all(line["hindsight_ratio"] > 0 for line in metrics)
@@ -400,7 +400,7 @@ def test_goal_free_rollouts_stay_if_only_the_goal_encoder_is_trained(vocabulary,
     config = replace(
         tiny.CATK, trained="goals", goal_probability=1.0, num_candidates=1000, learning_rate=1e-2, epochs=2.0
     )
-    model = catk_finetune(base.with_goal_conditioning("concat"), drawn_scenarios, tmp_path, config)
+    model = train_policy(base.with_goal_conditioning("concat"), drawn_scenarios, tmp_path, config)
     policy = SmartPolicy.from_pretrained(model).eval()
     batch = collate(drawn_scenarios[:2])
     goals = logged_goals(batch)
@@ -421,7 +421,7 @@ def test_a_policy_learns_where_its_own_rollouts_led(vocabulary, drawn_scenarios,
     base = tiny.tiny_policy(vocabulary).eval()
     start = copy.deepcopy(base)
     config = GcslConfig(epochs=12.0, batch_size=1, learning_rate=3e-2, max_trained_agents=None, device=tiny.CPU)
-    model = gcsl_finetune(base.with_goal_conditioning("indication"), drawn_scenarios, tmp_path, config)
+    model = train_policy(base.with_goal_conditioning("indication"), drawn_scenarios, tmp_path, config)
     policy = SmartPolicy.from_pretrained(model).eval()
     batch = collate(drawn_scenarios[:2])
     before = simulate(start, batch, num_rollouts=8, seed=31)
@@ -455,7 +455,7 @@ def test_the_reference_has_the_goals_of_the_policy_unless_set_otherwise(policy, 
 
 def test_goal_relabeling_needs_a_goal_encoder_and_is_not_validated(vocabulary, drawn_scenarios, tmp_path):
     with pytest.raises(ConfigError, match="not goal-conditioned: add --goal concat"):
-        gcsl_finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "run", GcslConfig(device=tiny.CPU))
+        train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "run", GcslConfig(device=tiny.CPU))
     with pytest.raises(ConfigError, match="does not change"):
         GcslConfig(validation=ValidationConfig(every=5))
     assert not (tmp_path / "run").exists()
@@ -467,22 +467,22 @@ def test_augmented_goals_belong_to_a_run_wherever_they_lie(policy, drawn_scenari
     goals = GoalConfig(probability=1.0, augmented=str(tmp_path / "gaols"))
     config = replace(CONFIG, goals=goals, epochs=0.25)
     with pytest.raises(DataError, match="holds no goals"):
-        finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
+        train_policy(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
     there = replace(config, goals=replace(goals, augmented=str(tmp_path / "goals")))
     strangers = [replace(drawn_scenarios[0], scenario_id="elsewhere")]
     with pytest.raises(DataError, match="its goals are of other scenarios"):
-        finetune(copy.deepcopy(policy), strangers, tmp_path / "run", there)
+        train_policy(copy.deepcopy(policy), strangers, tmp_path / "run", there)
     assert not (tmp_path / "run").exists()
     (tmp_path / "goals").rename(tmp_path / "gaols")
-    finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
+    train_policy(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
     (tmp_path / "gaols").rename(tmp_path / "moved")
     moved = replace(config, goals=replace(goals, augmented=str(tmp_path / "moved")))
-    finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
+    train_policy(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
     scenario = drawn_scenarios[0]
     point = (scenario.tracks.object_id[:1], scenario.origin[None] + 5.0)
     write_goal_file(tmp_path / "moved" / "part-000009.parquet", {scenario.scenario_id: point})
     with pytest.raises(CheckpointError, match="augmented_goals"):
-        finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
+        train_policy(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
 
 
 def test_rows_that_are_no_goals_are_refused(tmp_path):

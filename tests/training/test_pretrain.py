@@ -17,14 +17,14 @@ from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
 from rlftsim.training.checkpoint import newest_checkpoint
 from rlftsim.training.data import trained_agents
-from rlftsim.training.imitation import learning_rate, summed_loss
-from rlftsim.training.pretrain import PretrainConfig, pretrain
+from rlftsim.training.imitation import PretrainConfig, learning_rate, summed_loss
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 
 def test_a_tiny_model_learns_what_it_sees(vocabulary, drawn_scenarios, tmp_path):
     config = replace(tiny.PRETRAIN, epochs=15.0, batch_size=4, learning_rate=1e-2)
-    pretrain(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), drawn_scenarios, tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), drawn_scenarios, tmp_path, config)
     lines = read_metrics(tmp_path)
     assert lines[0]["loss"] > math.log(48) / 2  # fresh weights know little about 48 tokens
     assert lines[-1]["loss"] < 0.6 * lines[0]["loss"]
@@ -38,7 +38,7 @@ def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory(vocabulary,
         config = replace(
             tiny.PRETRAIN, epochs=1.0, batch_size=4, micro_batch_size=size, max_trained_agents=None, gradient_clip=1e9
         )
-        pretrain(policy, drawn_scenarios, tmp_path / str(size), config)
+        train_policy(policy, drawn_scenarios, tmp_path / str(size), config)
         found.append(tiny.gradients_of(policy))
     for gradients in found[1:]:
         for name, gradient in found[0].items():
@@ -94,9 +94,9 @@ class Weightless:
 
 def test_what_cannot_be_pre_trained_is_refused(drawn_scenarios, vocabulary, tmp_path):
     with pytest.raises(ConfigError, match="Weightless has no weights: there is nothing for pre-training to train"):
-        pretrain(Weightless(), drawn_scenarios, tmp_path, tiny.PRETRAIN)  # type: ignore[arg-type]
+        train_policy(Weightless(), drawn_scenarios, tmp_path, tiny.PRETRAIN)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="no scenario to train on"):
-        pretrain(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.PRETRAIN)
+        train_policy(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.PRETRAIN)
     with pytest.raises(ConfigError, match="must be positive"):
         PretrainConfig(batch_size=0)
 
@@ -104,7 +104,7 @@ def test_what_cannot_be_pre_trained_is_refused(drawn_scenarios, vocabulary, tmp_
 def test_the_loss_of_a_class_with_few_tokens_stays_a_plain_number(vocabulary, drawn_scenarios, tmp_path):
     assert not vocabulary.token_mask.all()  # some class has fewer tokens than the table has rows
     config = replace(tiny.PRETRAIN, epochs=0.25, label_smoothing=0.1)
-    pretrain(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert read_metrics(tmp_path)[0]["loss"] < 20.0
 
 
@@ -113,7 +113,7 @@ def test_smoothing_may_go_to_the_tokens_near_the_target(vocabulary, drawn_scenar
     losses = {}
     for kind in ("uniform", "spatial"):
         policy = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE)
-        pretrain(policy, drawn_scenarios, tmp_path / kind, replace(config, label_smoothing_kind=kind))
+        train_policy(policy, drawn_scenarios, tmp_path / kind, replace(config, label_smoothing_kind=kind))
         losses[kind] = read_metrics(tmp_path / kind)[0]["loss"]
     batch = collate(drawn_scenarios)
     dist = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).teacher_forced(batch, batch.agent_mask)
@@ -136,7 +136,7 @@ def test_the_entropy_of_predictions_is_logged(vocabulary, drawn_scenarios, tmp_p
     entropy, count = summed.sums["entropy"], summed.count
     assert float(entropy / count) == pytest.approx(float(entropies.mean()), rel=1e-5)
     config = replace(tiny.PRETRAIN, epochs=1.0, batch_size=len(drawn_scenarios))
-    pretrain(policy, drawn_scenarios, tmp_path, config)
+    train_policy(policy, drawn_scenarios, tmp_path, config)
     assert read_metrics(tmp_path)[0]["entropy"] == pytest.approx(float(entropies.mean()), rel=0.2)
 
 
@@ -149,14 +149,14 @@ def test_smoothing_among_near_tokens_needs_a_vocabulary(drawn_scenarios, tmp_pat
             raise AssertionError
 
     with pytest.raises(ConfigError, match=r"Wordless has no vocabulary.*label_smoothing_kind=uniform"):
-        pretrain(
+        train_policy(
             Wordless(1, 1),
             drawn_scenarios,
             tmp_path,
             replace(tiny.PRETRAIN, label_smoothing=0.1, label_smoothing_kind="spatial"),
         )
     with pytest.raises(ConfigError, match=r"Wordless has no vocabulary.*still_weight=1"):
-        pretrain(Wordless(1, 1), drawn_scenarios, tmp_path, replace(tiny.PRETRAIN, still_weight=0.1))
+        train_policy(Wordless(1, 1), drawn_scenarios, tmp_path, replace(tiny.PRETRAIN, still_weight=0.1))
 
 
 def test_standing_tokens_count_less(vocabulary, drawn_scenarios):
@@ -210,7 +210,7 @@ def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scena
     torch.manual_seed(0)
     policy = Followed(tiny.MODEL, vocabulary)
     start = copy.deepcopy(policy)
-    pretrain(policy, drawn_scenarios, tmp_path / "whole", config)
+    train_policy(policy, drawn_scenarios, tmp_path / "whole", config)
     last = load_file(newest_checkpoint(tmp_path / "whole" / "checkpoints") / "policy.safetensors")
     weights.append({name.removeprefix("network."): value for name, value in last.items()})
     saved = load_file(tmp_path / "whole" / "model" / "model.safetensors")
@@ -226,7 +226,7 @@ def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scena
     shutil.rmtree(tmp_path / "cut" / "model")
     for path in sorted((tmp_path / "cut" / "checkpoints").iterdir())[1:]:
         shutil.rmtree(path)
-    pretrain(start, drawn_scenarios, tmp_path / "cut", config)
+    train_policy(start, drawn_scenarios, tmp_path / "cut", config)
     again = load_file(tmp_path / "cut" / "model" / "model.safetensors")
     assert all(torch.equal(value, again[name]) for name, value in saved.items())
 

@@ -23,15 +23,20 @@ from rlftsim.scenario.synthetic import pack_path
 from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training import parallel
+from rlftsim.training.data import share_cache
 from rlftsim.training.goals import GoalConfig
-from rlftsim.training.parallel import DeviceConfig, all_reduce_sum
-from rlftsim.training.processes import in_processes
-from rlftsim.training.run import TrainingRun
+from rlftsim.training.parallel import DeviceConfig, all_reduce_sum, num_sharing_memory
+from rlftsim.training.processes import linked_processes
 from rlftsim.training.run_folder import read_metrics
 
 TWO = replace(tiny.CPU, processes=2)
 EXACT = {"gradient_clip": 1e9, "batch_size": 3, "epochs": 1.0}
 """A run whose last gradient is left in the parameters as it was computed."""
+
+
+def in_processes(work, device):
+    with linked_processes(work, device) as fabric:
+        return work(fabric)
 
 
 def train(stage, vocabulary, scenarios, out, device=TWO, config=tiny.MODEL, **changes):
@@ -149,7 +154,10 @@ def test_a_run_of_two_processes_is_resumed_bit_for_bit(
 ):
     changes = {"epochs": float(batch_size), "batch_size": batch_size}  # four updates, checkpoints after 2 and 4
     train(stage, vocabulary, drawn_scenarios, tmp_path / "whole", **changes)
-    module, name = {"pretrain": (imitation_module, "_update"), "everything": (finetune_module, "update_policy")}[stage]
+    module, name = {
+        "pretrain": (imitation_module, "update_imitator"),
+        "everything": (finetune_module, "update_policy"),
+    }[stage]
     original, calls = getattr(module, name), []
 
     def interrupted(*args, **options):
@@ -237,11 +245,11 @@ def test_processes_share_the_scenarios_in_memory(vocabulary, drawn_scenarios, tm
     assert sizes == [2, 2, 1, 1]  # of the two processes this one is seen
 
 
-def test_processes_share_out_the_cache_of_scenarios(vocabulary, tmp_path):
+def test_processes_share_out_the_cache_of_scenarios():
     def caches(size):
         data = ScenarioDataset(pack_path(), "training", cache_size=size)
-        run_in = lambda fabric: TrainingRun(tiny.tiny_policy(vocabulary), data, tmp_path, tiny.PRETRAIN, fabric)  # noqa: E731
-        return in_processes(run_in, TWO).scenarios.cache_size, in_processes(run_in, TWO).scenarios is data
+        share = in_processes(lambda fabric: share_cache(data, num_sharing_memory(fabric)), TWO)
+        return share.cache_size, share is data
 
     assert caches(100) == (50, False)  # of 160
     assert caches(400) == (400, True)  # each may keep all, and those at hand stay
@@ -254,7 +262,6 @@ import tiny
 from dataclasses import replace
 from pathlib import Path
 from rlftsim.rewards import register_reward
-from rlftsim.training.processes import in_processes
 
 @register_reward("of_this_script")
 def of_this_script(realism, rollouts, batch):

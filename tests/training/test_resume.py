@@ -26,7 +26,7 @@ MODULES = {
     **dict.fromkeys(("pretrain", "catk", "road"), imitation_module),
     **dict.fromkeys(("finetune", "everything"), finetune_module),
 }
-WORK = {imitation_module: "_update", finetune_module: "update_policy"}
+WORK = {imitation_module: "update_imitator", finetune_module: "update_policy"}
 STAGES = ["pretrain", "catk", "finetune"]
 
 

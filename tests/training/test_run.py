@@ -12,8 +12,9 @@ from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.runner import Inline
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.training import imitation
-from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
-from rlftsim.training.run import require_trainable
+from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.method import check_trainable
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 GCSL = GcslConfig(epochs=1.0, batch_size=1, num_rollouts=2, device=tiny.CPU)
@@ -28,7 +29,7 @@ def goal_conditioned(vocabulary):
 def test_one_scenario_and_a_path_as_text_are_enough(stage, vocabulary, drawn_scenarios, tmp_path):
     scenario, out = drawn_scenarios[0], str(tmp_path / "run")
     if stage == "gcsl":
-        model = gcsl_finetune(goal_conditioned(vocabulary), scenario, out, GCSL)
+        model = train_policy(goal_conditioned(vocabulary), scenario, out, GCSL)
     else:
         model = tiny.train(stage, tiny.tiny_policy(vocabulary), scenario, out, epochs=1.0)
     assert model == tmp_path / "run" / "model"
@@ -45,7 +46,7 @@ def test_a_second_run_in_a_folder_is_refused_until_the_first_has_ended(
     def train():
         device = replace(tiny.CPU, processes=processes)
         if stage == "gcsl":
-            return gcsl_finetune(goal_conditioned(vocabulary), drawn_scenarios[:2], tmp_path, GCSL)
+            return train_policy(goal_conditioned(vocabulary), drawn_scenarios[:2], tmp_path, GCSL)
         policy, changes = tiny.tiny_policy(vocabulary), {"epochs": 1.0, "batch_size": 2, "device": device}
         return tiny.train(stage, policy, drawn_scenarios[:2], tmp_path, **changes)
 
@@ -78,7 +79,7 @@ def test_all_attributes_that_a_policy_lacks_are_named():
     with pytest.raises(
         ConfigError, match="Linear cannot be trained with CAT-K: it has no vocabulary and no save_pretr"
     ):
-        require_trainable(torch.nn.Linear(1, 1), [None], "CAT-K", needs=("vocabulary",))
+        check_trainable(torch.nn.Linear(1, 1), [None], "CAT-K", needs=("vocabulary",))
 
 
 def test_a_run_of_imitation_whose_gradients_are_lost_stops(vocabulary, drawn_scenarios, tmp_path, monkeypatch, capsys):

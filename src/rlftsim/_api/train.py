@@ -12,9 +12,9 @@ from torch import nn
 from rlftsim._api.sources import policy_of, require_name
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
-from rlftsim.recipes.calibration import prepare_policy
-from rlftsim.recipes.card import model_card, with_cards_of
+from rlftsim.recipes.card import append_cards, model_card
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
+from rlftsim.recipes.train import describe_method, prepare_policy
 from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -24,9 +24,9 @@ from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
-from rlftsim.training.pretrain import PretrainConfig
-from rlftsim.training.pretrain import pretrain as pretrain_in_place
+from rlftsim.training.imitation import PretrainConfig
+from rlftsim.training.method import find_method
+from rlftsim.training.run import train_policy
 
 
 def recipe(name: str) -> Any:
@@ -91,7 +91,7 @@ def pretrain(
     return _train_copy(
         start,
         out,
-        lambda learner, folder: pretrain_in_place(learner, training, folder, settings, held_out=validation, card=card),
+        lambda learner, folder: train_policy(learner, training, folder, settings, held_out=validation, card=card),
     )
 
 
@@ -99,7 +99,7 @@ def finetune(
     policy: Policy | Name,
     scenarios: AnyScenarios,
     out: Name | None = None,
-    config: FinetuningConfig | None = None,
+    config: Any = None,
 ) -> Policy:
     """Fine-tune a policy in closed loop, and return a new one; the given policy stays as it is.
 
@@ -111,7 +111,8 @@ def finetune(
         out: folder of the run; an interrupted run goes on there, a finished one is not repeated, and with a reward and
             more epochs it is trained further. None keeps no files.
         config: settings, such as `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`; those
-            of a recipe's `catk`, `gcsl` or `calibrate` choose that method. None stands for the paper's settings.
+            of a recipe's `catk`, `gcsl` or `calibrate` choose that method, and so do those of a method of another
+            package. None stands for the paper's settings.
 
     Returns:
         The fine-tuned policy, ready to simulate.
@@ -122,13 +123,12 @@ def finetune(
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
         NotYetError: another run is at work in `out`.
     """
-    _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
+    if isinstance(config, PretrainConfig) or find_method(config) is None:
+        _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training, settings = to_scenarios(scenarios, "training"), config or FinetuneConfig()
     card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
     start = prepare_policy(policy_of(policy), settings)
-    return _train_copy(
-        start, out, lambda learner, folder: finetune_policy(learner, training, folder, settings, card=card)
-    )
+    return _train_copy(start, out, lambda learner, folder: train_policy(learner, training, folder, settings, card=card))
 
 
 def _require_config(config: object, section: str, *kinds: type) -> None:
@@ -178,4 +178,4 @@ def _card(what: str, scenarios: Scenarios, start: Policy | Name | None = None) -
     if isinstance(scenarios, ScenarioDataset):
         return model_card(what, scenarios.folder, len(scenarios), name)
     card = f"# Traffic model, {what}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"
-    return with_cards_of(card, [] if name is None else [name])
+    return append_cards(card, [] if name is None else [name])

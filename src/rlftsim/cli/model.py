@@ -18,7 +18,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.recipes.card import with_cards_of
+from rlftsim.recipes.card import append_cards
 
 Format = Literal["catk"]
 
@@ -112,7 +112,7 @@ class Average:
         scaled = "" if self.base is None else f"* scale {self.scale:g} from {self.base}\n"
         card = f"# Mean of {len(self.models)} models\n\n* {', '.join(self.models)}\n{scaled}"
         card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
-        average.save_pretrained(self.out, card=with_cards_of(card, [*self.models, *filter(None, [self.base])]))
+        average.save_pretrained(self.out, card=append_cards(card, [*self.models, *filter(None, [self.base])]))
         print(f"model: {self.out}")
         return 0
 

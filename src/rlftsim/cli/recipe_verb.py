@@ -12,7 +12,7 @@ from rlftsim.cli.mistakes import flags_of
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import SECTIONS, Recipe
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.recipes.settings import flags_of_file, sections_of
+from rlftsim.recipes.settings import flags_of_file, list_sections
 
 DEFAULT_RECIPE = "smart-tiny"
 """Recipe whose values a help text shows where none is named."""
@@ -27,6 +27,8 @@ class RecipeVerb:
 
     sections: ClassVar[tuple[str, ...]]
     """Sections whose fields have an effect."""
+    shown_sections: ClassVar[tuple[str, ...]]
+    """Sections that became fields."""
     starting_recipe: ClassVar[Recipe]
     starting_name: ClassVar[str]
     """Name of the recipe that the defaults are from. The parsed field `recipe` may turn out to be another."""
@@ -37,8 +39,8 @@ class RecipeVerb:
     @property
     def settings(self) -> Recipe:
         """The recipe with the values of the command line."""
-        shown = [name for name in sections_of(self.starting_recipe) if name in self.sections]
-        recipe = dataclasses.replace(self.starting_recipe, **{name: getattr(self, name) for name in shown})
+        sections = {name: getattr(self, name) for name in self.shown_sections}
+        recipe = dataclasses.replace(self.starting_recipe, **sections)
         return recipe if self.processes is None else recipe.with_processes(self.processes)
 
     @classmethod
@@ -57,9 +59,14 @@ class RecipeVerb:
         return recipe_by_name(name)
 
     @classmethod
+    def sections_for(cls, words: Sequence[str]) -> tuple[str, ...]:
+        """Sections whose fields are flags of a command line, of those that the recipe has."""
+        return cls.sections
+
+    @classmethod
     def sections_in_file(cls, words: Sequence[str]) -> tuple[str, ...]:
         """Sections that are read from the file of settings, of those that the recipe has."""
-        return cls.sections
+        return cls.sections_for(words)
 
     @classmethod
     def run_section(cls, words: Sequence[str]) -> str:
@@ -94,13 +101,19 @@ def with_settings(
     # 2. the recipe gives the sections and their defaults
     name = name or verb.recipe_name_in(words)
     recipe = verb.recipe_for(name, words)
-    shown = {name: section for name, section in sections_of(recipe).items() if name in verb.sections}
+    names = verb.sections_for(words)
+    shown = {name: section for name, section in list_sections(recipe).items() if name in names}
     fields: list[Any] = [(name, type(section), dataclasses.field(default=section)) for name, section in shown.items()]
     complete = dataclasses.make_dataclass(
         verb.__name__,
         fields,
         bases=(verb,),
-        namespace={"starting_recipe": recipe, "starting_name": name, "__doc__": verb.__doc__},
+        namespace={
+            "shown_sections": tuple(shown),
+            "starting_recipe": recipe,
+            "starting_name": name,
+            "__doc__": verb.__doc__,
+        },
         frozen=True,
         kw_only=True,
     )

@@ -13,19 +13,19 @@ from rlftsim.cli.recipe_verb import Processes, RecipeVerb, refuse_settings, valu
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.calibration_picture import write_calibration_picture
 from rlftsim.evaluation.learning_curve import write_learning_curve
-from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.train import GoalConditioning, finetune_model, pretrain_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.goal_relabeling import NOT_VALIDATED
+from rlftsim.training.method import METHODS, method_by_name
 from rlftsim.training.parallel import is_first_process
 
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
-SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "road": "road", "gcsl": "gcsl", "calibrate": "calibrate"}
 ClassName = Literal["vehicle", "pedestrian", "cyclist"]
 RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
@@ -157,13 +157,14 @@ class Finetune(RecipeVerb):
     """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
-    method: Literal["rlft", "catk", "road", "gcsl", "calibrate"] = "rlft"
+    method: Annotated[str, tyro.conf.arg(metavar="rlft|catk|road|gcsl|calibrate|NAME")] = "rlft"
     """rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised fine-tuning along rollouts
     that choose the token closest to the log among the top K, fields catk.*. road: supervised
     fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the goal-conditioned
     weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft with goals
     (--model OUT), fields gcsl.*. calibrate: fit the weights of a few named features on the token logits, no weight of
-    the model, to a realism reward without a change of speed, fields calibrate.*."""
+    the model, to a realism reward without a change of speed, fields calibrate.*. Another NAME: the method that another
+    package has registered, fields NAME.*."""
     goal: Literal["concat", "indication"] | None = None
     """Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
     --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
@@ -191,13 +192,20 @@ class Finetune(RecipeVerb):
             name: of the recipe.
             words: the words behind the verb.
         """
-        recipe = super().recipe_for(name, words)
+        recipe, section = super().recipe_for(name, words), cls.run_section(words)
+        if not hasattr(recipe, section):
+            recipe = recipe.with_section(section, method_by_name(section).settings())
         return recipe.with_goals() if value_of("--goal", words) else recipe
+
+    @classmethod
+    def sections_for(cls, words: Sequence[str]) -> tuple[str, ...]:
+        """Sections of the methods of this package, and that of the method."""
+        return tuple(dict.fromkeys((*cls.sections, cls.run_section(words))))
 
     @classmethod
     def run_section(cls, words: Sequence[str]) -> str:
         """Section of the method."""
-        return SECTION_OF_METHOD.get(value_of("--method", words) or "rlft", "finetune")
+        return section_of_method(value_of("--method", words) or "rlft")
 
     def refuse_useless(self, flags: Sequence[str]) -> None:
         """Refuse settings of other methods, and flags that need another flag.
@@ -206,7 +214,7 @@ class Finetune(RecipeVerb):
             ConfigError: one of them would have no effect.
         """
         # 1. settings of other methods
-        used = SECTION_OF_METHOD[self.method]
+        used = section_of_method(self.method)
         others = [section for section in self.sections if section != used]
         refuse_settings(flags, others, f"with --method {self.method}: its settings are --{used}.*")
         # 2. flags that need another flag
@@ -218,14 +226,13 @@ class Finetune(RecipeVerb):
 
     def run(self) -> int:
         """Load the model and fine-tune it."""
-        config = getattr(self.settings, SECTION_OF_METHOD[self.method])
+        config = getattr(self.settings, section_of_method(self.method))
         if config is None:
             raise ConfigError(
                 f"recipe {self.recipe} has no section {self.method}: name another recipe, or train by --method rlft."
             )
         scenarios = open_dataset(self.data, self.split)
-        # Of the methods of fine-tuning only CAT-K and RoaD validate.
-        every = config.validation.every if self.method in ("catk", "road") else 0
+        every = config.validation.every if method_by_name(self.method).validates else 0
         held_out = _held_out(self.data, self.validation_split, every)
         goals = None if self.goal is None else GoalConditioning(self.goal, self.goal_logit_bias)
         with _learning_curve(self.out):
@@ -234,6 +241,18 @@ class Finetune(RecipeVerb):
             write_calibration_picture(model)
         print(f"model: {model}")
         return 0
+
+
+def section_of_method(method: str) -> str:
+    """Section of a recipe with the settings of a method of fine-tuning: "finetune" for rlft, else the method's name.
+
+    Raises:
+        ConfigError: Unknown, with the nearest known name, or "pretrain", which is no fine-tuning.
+    """
+    if method == "pretrain":
+        raise ConfigError("method 'pretrain' has a command of its own: rlftsim pretrain --init-from MODEL.")
+    METHODS.get(method)
+    return "finetune" if method == "rlft" else method
 
 
 def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | None:

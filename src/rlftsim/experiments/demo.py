@@ -13,10 +13,10 @@ from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.report import report_table, write_report
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.demo_report import BASE, CEILING, FLOOR, TUNED, DemoConfig, animate, build_report
-from rlftsim.experiments.stages import find_vocabulary, finetune_model, open_training, pretrain_policy
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.progress import print_wide
 from rlftsim.policies.registry import load_policy
+from rlftsim.recipes.train import find_vocabulary, finetune_model, open_training, pretrain_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.viewer.picture import to_png
 

@@ -9,7 +9,7 @@ from rlftsim.recipes.base import Recipe
 from rlftsim.rewards import CreditTo
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goals import GoalConfig, with_goals
-from rlftsim.training.methods import FinetuningConfig
+from rlftsim.training.method import TrainingSettings
 
 WEAK_EPOCHS = 1.0
 """Pre-training of the paper's weaker base model."""
@@ -81,7 +81,7 @@ class FineTuned:
         goals = "" if self.goals is None else f"-{self.goals.name}"
         return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
-    def training_config(self, recipe: Recipe) -> FinetuningConfig:
+    def training_config(self, recipe: Recipe) -> TrainingSettings:
         """Settings of the training, of the type that the method has.
 
         Raises:

@@ -24,7 +24,10 @@ from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.model_specs import BASE, CATK, GCSL, ROAD, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
 from rlftsim.experiments.rows import Row
 from rlftsim.experiments.stage_progress import Stage, run_stages
-from rlftsim.experiments.stages import (
+from rlftsim.jobs.progress import log
+from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
+from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.train import (
     GoalConditioning,
     find_vocabulary,
     finetune_model,
@@ -32,9 +35,6 @@ from rlftsim.experiments.stages import (
     pretrain_policy,
     start_from_shorter_run,
 )
-from rlftsim.jobs.progress import log
-from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
-from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset

@@ -12,8 +12,8 @@ pyproject.toml of its package:
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from typing import Any, Literal
 
 from torch import nn
 
@@ -26,7 +26,8 @@ from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import with_goals
-from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.imitation import PretrainConfig
+from rlftsim.training.parallel import DeviceConfig
 
 SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl", "calibrate")
 """Sections that the verbs of the command line know, in the order of their use; see `section_names`."""
@@ -87,7 +88,7 @@ class Recipe:
         """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`.
 
         Args:
-            policy: the existing one.
+            policy: Existing policy, whose weights training starts from.
             vocabulary: tokens in place of its own; None = it keeps them.
             keep: classes whose tokens stay its own all the same, see `align_vocabulary`.
 
@@ -111,18 +112,30 @@ class Recipe:
         )
         return replace(self, finetune=finetune, catk=catk, road=road)
 
+    def with_section(self, name: str, section: Any) -> Any:
+        """The same recipe with a further section, such as the settings of another package's training method.
+
+        Args:
+            name: Name of the section, which no field of the recipe has.
+            section: Dataclass of settings, with the values that the recipe gives them.
+        """
+        extended = make_dataclass(
+            type(self).__name__, [(name, type(section))], bases=(type(self),), frozen=True, kw_only=True
+        )
+        return extended(**{entry.name: getattr(self, entry.name) for entry in fields(self)}, **{name: section})
+
     def with_processes(self, processes: int | Literal["auto"]) -> "Recipe":
         """The same recipe, trained by so many processes on this machine, see `DeviceConfig.processes`."""
-        methods = {name: getattr(self, name) for name in SECTIONS[2:]}
-        changed = {
-            name: replace(method, device=replace(method.device, processes=processes))
-            for name, method in methods.items()
-            if method is not None
+        sections = {name: getattr(self, name) for name in section_names(self)}
+        changed: dict[str, Any] = {
+            name: replace(section, device=replace(section.device, processes=processes))
+            for name, section in sections.items()
+            if isinstance(getattr(section, "device", None), DeviceConfig)
         }
         return replace(self, **changed)
 
 
 def section_names(recipe: Recipe) -> tuple[str, ...]:
     """Names of the sections of a recipe: the known ones in the order of their use, then its own."""
-    present = [one.name for one in fields(recipe) if is_dataclass(getattr(recipe, one.name))]
+    present = [entry.name for entry in fields(recipe) if is_dataclass(getattr(recipe, entry.name))]
     return tuple(sorted(present, key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)))

@@ -20,55 +20,55 @@ from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
 def recipe_as_json(recipe: Recipe) -> str:
     """A recipe as JSON, a mapping for each section. `--config FILE` reads it back."""
-    return json.dumps({name: to_plain(section) for name, section in sections_of(recipe).items()}, indent=1)
+    return json.dumps({name: to_plain(section) for name, section in list_sections(recipe).items()}, indent=1)
 
 
 def recipe_as_text(recipe: Recipe) -> str:
     """A recipe with the documentation of every field as a comment above it, in the notation of YAML."""
     return "\n\n".join(
-        "\n".join([f"# {summary_of(type(section))}", f"{name}:", *_lines_of(section, "  ")])
-        for name, section in sections_of(recipe).items()
+        "\n".join([f"# {summarize_docstring(type(section))}", f"{name}:", *_write_lines(section, "  ")])
+        for name, section in list_sections(recipe).items()
     )
 
 
-def sections_of(recipe: Recipe) -> dict[str, Any]:
+def list_sections(recipe: Recipe) -> dict[str, Any]:
     """Sections that a recipe has, by name, in the order of their use."""
     return {name: getattr(recipe, name) for name in section_names(recipe)}
 
 
-def summary_of(documented: object) -> str:
+def summarize_docstring(documented: object) -> str:
     """First sentence or line of a docstring."""
     return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
-def _lines_of(section: Any, indent: str) -> Iterator[str]:
+def _write_lines(section: Any, indent: str) -> Iterator[str]:
     documentation = field_documentation(type(section))
     for field in fields(section):
         value = getattr(section, field.name)
         # A section without a docstring of its own is described by its class.
-        text = documentation.get(field.name) or (summary_of(type(value)) if is_dataclass(value) else "")
+        text = documentation.get(field.name) or (summarize_docstring(type(value)) if is_dataclass(value) else "")
         yield from (f"{indent}# {line}" for line in textwrap.wrap(text, 110))
         if is_dataclass(value):
             yield f"{indent}{field.name}:"
-            yield from _lines_of(value, f"{indent}  ")
+            yield from _write_lines(value, f"{indent}  ")
         else:
             yield f"{indent}{field.name}: {json.dumps(to_plain(value))}"
 
 
 def field_documentation(config: type) -> dict[str, str]:
     """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
-    found: dict[str, str] = {}
+    documentation: dict[str, str] = {}
     for owner in reversed(config.__mro__):
         if not is_dataclass(owner):
             continue
         body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
         # A field's docstring is the string that follows it; at run time it is gone, so the source is read.
-        for statement, after in pairwise(body):
+        for statement, following in pairwise(body):
             if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
                 continue
-            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                found[statement.target.id] = " ".join(str(after.value.value).split())
-    return found
+            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
+                documentation[statement.target.id] = " ".join(str(following.value.value).split())
+    return documentation
 
 
 def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
@@ -95,18 +95,20 @@ def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_secti
         if not isinstance(values[name], Mapping):
             raise ConfigError(f"{path}: {name} is {json.dumps(values[name])}, not settings by name.")
     # 2. unknown names are refused here, in the words of the file; tyro would name a flag that was never given
-    known = {f"{name}.{field}" for name, section in sections_of(recipe).items() for field in flatten(to_plain(section))}
-    given = flatten(values)
-    unknown = sorted(set(given) - known)
-    if unknown:
-        inside = [name for name in known if name.startswith(f"{unknown[0]}.")]
-        names = sorted(known) if is_run or is_recipe else [*run_fields, *sorted(known)]
-        near = sorted(inside) or difflib.get_close_matches(unknown[0], names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"sections are {', '.join(sections_of(recipe))}."
-        raise ConfigError(f"{path}: no setting {unknown[0][:100]}: {hint}")
+    expected_names = {
+        f"{name}.{field}" for name, section in list_sections(recipe).items() for field in flatten(to_plain(section))
+    }
+    values_by_name = flatten(values)
+    unexpected_names = sorted(set(values_by_name) - expected_names)
+    if unexpected_names:
+        inside = [name for name in expected_names if name.startswith(f"{unexpected_names[0]}.")]
+        names = sorted(expected_names) if is_run or is_recipe else [*run_fields, *sorted(expected_names)]
+        candidates = sorted(inside) or difflib.get_close_matches(unexpected_names[0], names, n=1)
+        hint = f"did you mean {candidates[0]}?" if candidates else f"sections are {', '.join(list_sections(recipe))}."
+        raise ConfigError(f"{path}: no setting {unexpected_names[0][:100]}: {hint}")
     # 3. values become words; tyro checks their types
     words: list[str] = []
-    for name, value in given.items():
+    for name, value in values_by_name.items():
         if name.partition(".")[0] not in sections:
             continue
         group, _, last = name.rpartition(".")
@@ -120,14 +122,14 @@ def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
 
     Args:
         name: dotted name, e.g. "finetune.kl.target".
-        value: as JSON has it: a number, a text, true, false, null or a list.
+        value: Value in JSON: a number, a text, true, false, null or a list.
         is_switch: True = written `--name` or `--no-name`, without a value.
     """
     group, dot, last = name.replace("_", "-").rpartition(".")
     if is_switch and isinstance(value, bool):
         return [f"--{group}{dot}{'' if value else 'no-'}{last}"]
     values = value if isinstance(value, list | tuple) else [value]
-    return [f"--{group}{dot}{last}", *(str(one) for one in values)]
+    return [f"--{group}{dot}{last}", *(str(item) for item in values)]
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:

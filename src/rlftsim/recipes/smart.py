@@ -20,7 +20,7 @@ from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig
-from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.reference import KlConfig
 
 
@@ -81,7 +81,7 @@ class SmartRecipe(Recipe):
         """A policy with the sizes of this recipe and the weights of an existing one.
 
         Args:
-            policy: the existing one.
+            policy: Existing SMART policy, whose weights training starts from.
             vocabulary: tokens in place of its own, see `align_vocabulary`; None = it keeps them.
             keep: classes whose tokens stay its own all the same.
 
@@ -95,8 +95,10 @@ class SmartRecipe(Recipe):
                 "each class of this model has a head of its own, whose places other tokens cannot take: leave "
                 "--vocabulary out."
             )
-        own = policy.vocabulary
-        further = self.new_policy(own if vocabulary is None else align_vocabulary(vocabulary, own, keep=keep))
+        base_vocabulary = policy.vocabulary
+        further = self.new_policy(
+            base_vocabulary if vocabulary is None else align_vocabulary(vocabulary, base_vocabulary, keep=keep)
+        )
         load_strictly(further, policy.state_dict(), source="the model to train further")
         return further
 

@@ -15,7 +15,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.reference import KlConfig
 
 
@@ -72,9 +72,9 @@ class TrafficBotsRecipe(Recipe):
         """A policy with the sizes of this recipe and the weights of an existing one.
 
         Args:
-            policy: the existing one.
-            vocabulary: refused.
-            keep: not used.
+            policy: Existing TrafficBots policy, whose weights training starts from.
+            vocabulary: None, since the model has no tokens; anything else is refused.
+            keep: Classes whose tokens would stay; without effect here.
 
         Raises:
             CheckpointError: the weights are of other sizes.

@@ -90,11 +90,11 @@ class Running:
     count: int = 0
     """Updates with a finite value."""
 
-    def after(self, value: float, config: AlarmConfig) -> "Running":
+    def add(self, value: float, config: AlarmConfig) -> "Running":
         """The means with one more update.
 
         Args:
-            value: of the statistic in that update.
+            value: Value of the statistic in that update; not counted where not finite.
             config: number of first updates and window.
         """
         if not math.isfinite(value):
@@ -118,19 +118,19 @@ class Alarms:
 
         Args:
             logged: metrics of the update, by name.
-            config: the thresholds.
+            config: Thresholds of the alarms, and the lengths of both means in updates.
 
         Returns:
             The level of every alarm, and messages of those that are raised by this update.
         """
         levels, raised = {}, []
         for monitor in DRIFT_MONITORS:
-            before = self.means[monitor.alarm]
-            after = self.means[monitor.alarm] = before.after(logged[monitor.statistic], config)
-            levels[monitor.alarm] = monitor.drift(after.start, after.now, config)
+            previous_mean = self.means[monitor.alarm]
+            mean = self.means[monitor.alarm] = previous_mean.add(logged[monitor.statistic], config)
+            levels[monitor.alarm] = monitor.drift(mean.start, mean.now, config)
             # Only on the way up, so that an alarm that lasts is one message and not one per update.
-            if levels[monitor.alarm] >= 1 > monitor.drift(before.start, before.now, config):
-                raised.append(f"{monitor.alarm}: {monitor.words.format(now=after.now, start=after.start)}")
+            if levels[monitor.alarm] >= 1 > monitor.drift(previous_mean.start, previous_mean.now, config):
+                raised.append(f"{monitor.alarm}: {monitor.words.format(now=mean.now, start=mean.start)}")
         return levels, raised
 
     def to_numbers(self) -> dict[str, float]:

@@ -23,12 +23,12 @@ def scenario_costs(scenarios: Scenarios) -> Float[np.ndarray, "n"]:
 
     The index of a data set has the counts without a scenario being read; the scenarios of a list are counted here.
     """
-    counts = counts_of(scenarios, (*AGENT_COLUMNS, "num_map_points"))
+    counts = count_columns(scenarios, (*AGENT_COLUMNS, "num_map_points"))
     # Thousands, so that budgets are numbers a person can write.
     return (counts[-1] + MAP_POINTS_PER_AGENT * counts[:-1].sum(0)) / 1000.0
 
 
-def counts_of(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndarray, "columns n"]:
+def count_columns(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndarray, "columns n"]:
     """Counts of each scenario by columns of the index, from the index of a data set without a scenario being read.
 
     Args:
@@ -41,16 +41,16 @@ def counts_of(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndarray,
     return np.array([[getattr(row, name) for row in rows] for name in columns], dtype=np.int64)
 
 
-def refuse_unscored(scenarios: Scenarios) -> None:
+def check_scored(scenarios: Scenarios) -> None:
     """Check before a run begins that the metric, and so a reward, is defined for each scenario.
 
     Args:
-        scenarios: to be rewarded in.
+        scenarios: Training scenarios that a method scores rollouts of.
 
     Raises:
         DataError: some have no logged future or no evaluated agent; the first is named.
     """
-    num_steps, num_evaluated = counts_of(scenarios, ("num_steps", "num_evaluated"))
+    num_steps, num_evaluated = count_columns(scenarios, ("num_steps", "num_evaluated"))
     unscored = np.flatnonzero((num_steps < TOTAL_STEPS) | (num_evaluated == 0))
     if len(unscored):
         first = scenarios[int(unscored[0])]
@@ -61,23 +61,23 @@ def refuse_unscored(scenarios: Scenarios) -> None:
         )
 
 
-def balance_by_cost(costs: Sequence[float] | Float[np.ndarray, "n"], num_parts: int) -> list[list[int]]:
+def balance_by_cost(costs: Sequence[float] | Float[np.ndarray, "n"], num_groups: int) -> list[list[int]]:
     """Greedy load balancing: places of a list, in parts of about equal cost, so that no process waits long for another.
 
     The most expensive place goes first, each to the part that is cheapest so far; equal costs are dealt out in turn.
 
     Args:
-        costs: of each place.
-        num_parts: some stay empty if there are fewer places.
+        costs: Cost of each item, in any unit.
+        num_groups: Number of groups; some stay empty where items are fewer.
     """
-    parts: list[list[int]] = [[] for _ in range(num_parts)]
-    spent = np.zeros(num_parts)
+    groups: list[list[int]] = [[] for _ in range(num_groups)]
+    spent = np.zeros(num_groups)
     # Stable, so that all processes deal alike.
-    for place in np.argsort(-np.asarray(costs, float), kind="stable"):
+    for index in np.argsort(-np.asarray(costs, float), kind="stable"):
         cheapest = int(spent.argmin())
-        parts[cheapest].append(int(place))
-        spent[cheapest] += costs[place]
-    return [sorted(part) for part in parts]
+        groups[cheapest].append(int(index))
+        spent[cheapest] += costs[index]
+    return [sorted(group) for group in groups]
 
 
 def micro_batches(
@@ -86,17 +86,17 @@ def micro_batches(
     """Scenarios cut into pieces of similar size, the most expensive first, so that running out of memory shows at once.
 
     Args:
-        items: scenario indices.
-        costs: of all scenarios.
-        max_count: scenarios of a piece at most.
-        max_cost: of a piece's scenarios together, at most; one that costs more is a piece of its own. None = no limit.
+        items: Indices of the scenarios in the data set.
+        costs: Costs [n] of all scenarios of the data set, thousands of map points.
+        max_count: Scenarios of a batch at most.
+        max_cost: Summed cost of a batch at most; a scenario that costs more is a batch by itself. None = no limit.
     """
     budget = np.inf if max_cost is None else max_cost
-    pieces: list[list[int]] = []
+    batches: list[list[int]] = []
     # Sorted by cost, neighbors in this order are alike, and little memory goes to padding.
     for item in sorted(items, key=lambda i: -costs[i]):
-        if pieces and len(pieces[-1]) < max_count and costs[[*pieces[-1], item]].sum() <= budget:
-            pieces[-1].append(item)
+        if batches and len(batches[-1]) < max_count and costs[[*batches[-1], item]].sum() <= budget:
+            batches[-1].append(item)
         else:
-            pieces.append([item])
-    return pieces
+            batches.append([item])
+    return batches

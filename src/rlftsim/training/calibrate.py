@@ -13,11 +13,9 @@ that of all weights of a network is not after tens of thousands. K features, C c
 """
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,24 +29,16 @@ from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, 
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rewards import compute_rewards, parse_reward, write_reward
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.rollout.policy import Policy, Sampling
+from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
-from rlftsim.training.constraints import CONSTRAINTS, against_others
+from rlftsim.training.constraints import CONSTRAINTS, subtract_baseline
 from rlftsim.training.data import batch_with_futures
+from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.natural_step import best_length, natural_direction, t_value
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, num_sharing_memory
-from rlftsim.training.run import (
-    Learner,
-    TrainingRun,
-    TrainingScenarios,
-    UpdateReport,
-    as_scenarios,
-    require_trainable,
-    train_in_processes,
-)
 
 SUB_SCORES = ("kinematic", "interactive", "map_based")
 MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
@@ -109,9 +99,9 @@ class CalibrateConfig:
             raise ConfigError(f"held_back is a fraction between 0 and 1, got {self.held_back}.")
         if not self.lengths or min(self.lengths) <= 0:
             raise ConfigError(f"lengths are numbers above 0, at least one, got {self.lengths}.")
-        unknown = [name for name in self.constraints if name not in CONSTRAINTS]
-        if unknown:
-            raise ConfigError(f"no constraint {unknown[0]!r}: there are {', '.join(CONSTRAINTS)}.")
+        unexpected = [name for name in self.constraints if name not in CONSTRAINTS]
+        if unexpected:
+            raise ConfigError(f"no constraint {unexpected[0]!r}: there are {', '.join(CONSTRAINTS)}.")
         metric_by_name(self.metric)
         object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
 
@@ -129,7 +119,7 @@ class CalibrateConfig:
         """Scenarios for the direction, and those held back for its length.
 
         Args:
-            num_scenarios: In the data set.
+            num_scenarios: Number of scenarios in the data set, at least 2.
 
         Raises:
             ConfigError: Fewer than two.
@@ -137,20 +127,20 @@ class CalibrateConfig:
         if num_scenarios < 2:
             raise ConfigError("calibration needs at least 2 scenarios: one for the direction and one for its length.")
         key = derive_seed(self.seed, "calibrate") % 2**32
-        chosen = np.random.default_rng(key).permutation(num_scenarios)[: self.num_scenarios].tolist()
-        num_held = min(max(round(self.held_back * len(chosen)), 1), len(chosen) - 1)
-        return chosen[num_held:], chosen[:num_held]
+        selected = np.random.default_rng(key).permutation(num_scenarios)[: self.num_scenarios].tolist()
+        num_held_back = min(max(round(self.held_back * len(selected)), 1), len(selected) - 1)
+        return selected[num_held_back:], selected[:num_held_back]
 
     def tasks(self, num_scenarios: int) -> list[tuple[int | None, list[int]]]:
         """Batches of the run in their order: which length they try (0 = none of it; None = they find the direction),
         and positions in the list of those scenarios.
 
         Args:
-            num_scenarios: In the data set.
+            num_scenarios: Number of scenarios in the data set, at least 2.
         """
-        fitted, held = self.split(num_scenarios)
-        stages: list[tuple[int | None, int]] = [(None, len(fitted))]
-        stages += [(index, len(held)) for index in range(len(self.lengths) + 1)]
+        fitted_ids, held_back_ids = self.split(num_scenarios)
+        stages: list[tuple[int | None, int]] = [(None, len(fitted_ids))]
+        stages += [(index, len(held_back_ids)) for index in range(len(self.lengths) + 1)]
         return [
             (stage, list(range(first, min(first + self.batch_size, count))))
             for stage, count in stages
@@ -162,50 +152,33 @@ class CalibrateConfig:
         return len(self.tasks(num_scenarios))
 
 
-def calibrate(
-    policy: Policy,
-    scenarios: TrainingScenarios,
-    out: str | os.PathLike[str],
-    config: CalibrateConfig,
-    *,
-    card: str = "",
-) -> Path:
-    """Fit the weights of a policy's features in place; resumes where a run in `out` was stopped.
+class CalibrateMethod(Method[CalibrateConfig]):
+    """Fit the weights of a `CalibratablePolicy`'s features, such as `policies.calibrated.policy.CalibratedPolicy`."""
 
-    Args:
-        policy: A `CalibratablePolicy`, such as `policies.calibrated.policy.CalibratedPolicy(base, config.features)`.
-        scenarios: Data set, list or one scenario, with their futures.
-        out: Folder of the run.
-        config: Settings; their features are those of the policy.
-        card: README of the resulting model folder; the policy adds the table of features.
+    settings = CalibrateConfig
+    title = "calibrate"
 
-    Returns:
-        The model folder, `out/model`.
+    def describe(self, settings: CalibrateConfig) -> str:
+        """Number of features, and the reward."""
+        return f"calibration of {len(settings.features)} features, {settings.reward}"
 
-    Raises:
-        ConfigError: The policy has no such features, or there are too few scenarios.
-        DataError: A scenario has no logged future or no evaluated agent.
-        CheckpointError: `out` holds another run.
-        NotYetError: Another run is at work in `out`.
-    """
-    scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), rewarded=True)
-    if tuple(model.features) != config.features:
-        raise ConfigError(
-            f"the policy has the features {', '.join(model.features)}, the settings others: make it with "
-            "CalibratedPolicy(base, config.features)."
-        )
-    config.split(len(scenarios))
+    def start(
+        self, policy: Any, scenarios: Scenarios, settings: CalibrateConfig, fabric: Fabric
+    ) -> "CalibrationLearner":
+        """Learner of the features' weights; the features have to be those of the settings."""
+        check_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), is_rewarded=True)
+        if tuple(policy.features) != settings.features:
+            raise ConfigError(
+                f"the policy has the features {', '.join(policy.features)}, the settings others: make it with "
+                "CalibratedPolicy(base, config.features)."
+            )
+        policy.to(fabric.device).eval().requires_grad_(False)
+        optimizer = torch.optim.SGD([policy.eta])
+        return CalibrationLearner(policy=policy, optimizer=optimizer, config=settings, scenarios=scenarios)
 
-    def train(config: CalibrateConfig, fabric: Fabric) -> Path:
-        run = TrainingRun(policy, scenarios, out, config, fabric)
-        model.to(fabric.device).eval().requires_grad_(False)
-        learner = CalibrationLearner(
-            policy=model, optimizer=torch.optim.SGD([model.eta]), config=config, scenarios=scenarios
-        )
-        return run.train(learner, lambda: learner.work(fabric), title="calibrate", card=card)
-
-    return train_in_processes(train, config, len(scenarios), out)
+    def update(self, learner: "CalibrationLearner", scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
+        """Measure the next batch of scenarios, which the learner chooses itself."""
+        return learner.measure(fabric)
 
 
 class Statistics(nn.Module):
@@ -226,27 +199,26 @@ class Statistics(nn.Module):
     scores: Tensor
     """[1 + lengths, scenario held back, score]: as in `SCORES` of the learner."""
 
-    def __init__(self, num_fitted: int, num_held: int, config: CalibrateConfig):
+    def __init__(self, num_fitted: int, num_held_back: int, config: CalibrateConfig):
         super().__init__()
         width, num_credits = len(config.features), 1 + len(SUB_SCORES) + len(config.constraints)
         self.register_buffer("gradients", torch.zeros(num_fitted, num_credits, width, dtype=torch.float64))
         self.register_buffer("fisher", torch.zeros(width, width, dtype=torch.float64))
         self.register_buffer("counts", torch.zeros(3, dtype=torch.float64))
-        num_scores = len(MEASURED) + len(CONSTRAINTS) + 2
-        self.register_buffer("scores", torch.zeros(1 + len(config.lengths), num_held, num_scores, dtype=torch.float64))
+        shape = 1 + len(config.lengths), num_held_back, len(MEASURED) + len(CONSTRAINTS) + 2
+        self.register_buffer("scores", torch.zeros(shape, dtype=torch.float64))
 
 
 @dataclass(eq=False, kw_only=True)
 class CalibrationLearner(Learner):
     """A policy whose features get weights, and the statistics that these follow from."""
 
-    config: CalibrateConfig
     scenarios: Scenarios
 
     def __post_init__(self) -> None:
-        self.fitted, self.held = self.config.split(len(self.scenarios))
+        self.fitted_ids, self.held_back_ids = self.config.split(len(self.scenarios))
         self.tasks = self.config.tasks(len(self.scenarios))
-        self.statistics = Statistics(len(self.fitted), len(self.held), self.config)
+        self.statistics = Statistics(len(self.fitted_ids), len(self.held_back_ids), self.config)
         self.start = self.policy.eta.detach().clone()
         self.names = (*MEASURED, *CONSTRAINTS, "kl", "num_decisions")
 
@@ -260,21 +232,21 @@ class CalibrationLearner(Learner):
         """The statistics: a checkpoint needs nothing else."""
         return {"statistics": self.statistics}
 
-    def work(self, fabric: Fabric) -> UpdateReport:
+    def measure(self, fabric: Fabric) -> UpdateReport:
         """Measure the next batch of scenarios.
 
         Args:
             fabric: Processes, each of which measures a part of them.
         """
-        stage, places = self.tasks[self.update]
+        stage, positions = self.tasks[self.update]
         # Row by row and added to zeros, so that no number depends on the processes.
-        own = places[fabric.global_rank :: fabric.world_size]
+        process_positions = positions[fabric.global_rank :: fabric.world_size]
         size = max(self.config.micro_batch_size // num_sharing_memory(fabric), 1)
-        parts = [own[first : first + size] for first in range(0, len(own), size)]
+        batches = [process_positions[first : first + size] for first in range(0, len(process_positions), size)]
         if stage is None:
-            values = self._find_gradients(places, parts, fabric)
+            values = self._find_gradients(positions, batches, fabric)
         else:
-            values = self._try_length(stage, places, parts, fabric)
+            values = self._try_length(stage, positions, batches, fabric)
         self.finish_update(is_good=True)
         return UpdateReport(values, self._note(stage, values))
 
@@ -313,8 +285,8 @@ class CalibrationLearner(Learner):
                 "t": t_value(gradients[:, 0, index]),
                 "rmm": float(step[index] * gradients[:, 0, index].mean()),
                 **{
-                    score: float(step[index] * gradients[:, 1 + place, index].mean())
-                    for place, score in enumerate(SUB_SCORES)
+                    score: float(step[index] * gradients[:, 1 + position, index].mean())
+                    for position, score in enumerate(SUB_SCORES)
                 },
             }
             for index, name in enumerate(self.config.features)
@@ -334,7 +306,7 @@ class CalibrationLearner(Learner):
         return eta, {
             "reward": self.config.reward,
             "constraints": list(self.config.constraints),
-            "num_scenarios": [len(self.fitted), len(self.held)],
+            "num_scenarios": [len(self.fitted_ids), len(self.held_back_ids)],
             "num_rollouts": self.config.num_rollouts,
             "length": length,
             "base": {name: float(np.nanmean(scores[name][0])) for name in self.names[:-2]},
@@ -344,10 +316,10 @@ class CalibrationLearner(Learner):
 
     # ---- what is measured -------------------------------------------------------------------------------------------
 
-    def _find_gradients(self, places: list[int], parts: list[list[int]], fabric: Fabric) -> dict[str, float]:
+    def _find_gradients(self, positions: list[int], batches: list[list[int]], fabric: Fabric) -> dict[str, float]:
         """Gradients and Fisher matrix of some scenarios, into the statistics."""
         statistics, device = self.statistics, fabric.device
-        measured = [(part, *self._measure_credits(part, fabric)) for part in parts]
+        measured = [(batch_positions, *self._measure_credits(batch_positions, fabric)) for batch_positions in batches]
         counts = torch.zeros(3, dtype=torch.float64, device=device)
         for _, batch, _, credits, decisions, _ in measured:
             earned = credits[0][batch.evaluated_mask[:, None].expand_as(credits[0])]
@@ -356,58 +328,65 @@ class CalibrationLearner(Learner):
             )
         statistics.counts += all_reduce_sum(counts, fabric).cpu()
         limit = self.config.clip * math.sqrt(float(statistics.counts[2] / statistics.counts[1].clamp(min=1)))
-        rows = torch.zeros(len(places), *statistics.gradients.shape[1:], dtype=torch.float64, device=device)
+        rows = torch.zeros(len(positions), *statistics.gradients.shape[1:], dtype=torch.float64, device=device)
         fisher = torch.zeros_like(statistics.fisher, device=device)
         rmm = torch.zeros(2, dtype=torch.float64, device=device)
-        for part, _, score, credits, _, realism in measured:
+        for batch_positions, _, score, credits, _, realism in measured:
             credits = torch.cat([credits[:1].clamp(-limit, limit), credits[1:]])  # [credit, B, N, A]
-            found = torch.einsum("cbna,bnak->bck", credits, score)
-            rows[[places.index(place) for place in part]] = found
+            gradients = torch.einsum("cbna,bnak->bck", credits, score)
+            rows[[positions.index(position) for position in batch_positions]] = gradients
             flat = score.flatten(0, 2)
             fisher += flat.T @ flat
             rmm += torch.stack([realism.meta_metric.double().nansum(), realism.meta_metric.isfinite().sum()])
-        statistics.gradients[places] = all_reduce_sum(rows, fabric).cpu()
+        statistics.gradients[positions] = all_reduce_sum(rows, fabric).cpu()
         statistics.fisher += all_reduce_sum(fisher, fabric).cpu()
         total, count = all_reduce_sum(rmm, fabric).tolist()
         return {"rmm": total / max(count, 1.0), "credit_std": limit / self.config.clip}
 
     def _measure_credits(
-        self, part: list[int], fabric: Fabric
+        self, batch_positions: list[int], fabric: Fabric
     ) -> tuple[ScenarioBatch, Tensor, Tensor, Tensor, RealismResult]:
         """Batch, score function [B, N, A, K], credits [credit, B, N, A], decisions [B], realism."""
-        batch = batch_with_futures(self.scenarios, [self.fitted[place] for place in part]).to(fabric.device)
+        batch = self._load(batch_positions, self.fitted_ids, fabric)
         rollouts, recorder = self._simulate(batch, "direction", fabric)
         realism, agents = self._score(batch, rollouts)
         rewards = compute_rewards(parse_reward(self.config.reward), realism, rollouts, batch, agents, credit_mixing=0.0)
         decides = rollouts.decision_mask.any(-1)  # [B, N, A]
-        own = [rewards.by_agent.double(), *(agents.sub_scores[name].double() for name in SUB_SCORES)]
+        shares = [rewards.by_agent.double(), *(agents.sub_scores[name].double() for name in SUB_SCORES)]
         # A leave-one-out reward is centered on all rollouts: on the others it is larger by N / (N - 1).
-        credits = [against_others(values) for values in own]
+        credits = [subtract_baseline(values) for values in shares]
         for name in self.config.constraints:
             constraint = CONSTRAINTS[name]
-            credits.append(constraint.credit(constraint.parts(batch, rollouts, agents).double()))
+            credits.append(constraint.credit(constraint.shares(batch, rollouts, agents).double()))
         stacked = torch.stack([torch.where(decides, values.nan_to_num(), 0.0) for values in credits])
         return batch, recorder.score.double(), stacked, rollouts.decision_mask.flatten(1).sum(1), realism
 
-    def _try_length(self, stage: int, places: list[int], parts: list[list[int]], fabric: Fabric) -> dict[str, float]:
+    def _try_length(
+        self, stage: int, positions: list[int], batches: list[list[int]], fabric: Fabric
+    ) -> dict[str, float]:
         """Scores of some of the scenarios held back with a length of the step, into the statistics."""
         length = (0.0, *self.config.lengths)[stage]
         with torch.no_grad():
             self.policy.eta.copy_(self.start + torch.from_numpy(length * self.direction).to(self.start))
-        rows = torch.zeros(len(places), len(self.names), dtype=torch.float64, device=fabric.device)
-        for part in parts:
-            batch = batch_with_futures(self.scenarios, [self.held[place] for place in part]).to(fabric.device)
+        rows = torch.zeros(len(positions), len(self.names), dtype=torch.float64, device=fabric.device)
+        for batch_positions in batches:
+            batch = self._load(batch_positions, self.held_back_ids, fabric)
             rollouts, recorder = self._simulate(batch, "length", fabric)
             realism, agents = self._score(batch, rollouts)
             values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
-            values |= {name: one.value(one.parts(batch, rollouts, agents)) for name, one in CONSTRAINTS.items()}
+            values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in CONSTRAINTS.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
-            rows[[places.index(place) for place in part]] = torch.stack([values[n].double() for n in self.names], -1)
+            rows[[positions.index(position) for position in batch_positions]] = torch.stack(
+                [values[n].double() for n in self.names], -1
+            )
         rows = all_reduce_sum(rows, fabric).cpu()
-        self.statistics.scores[stage, places] = rows
+        self.statistics.scores[stage, positions] = rows
         means = dict(zip(self.names, rows.nanmean(0).tolist()))
         kl = means.pop("kl") / max(means.pop("num_decisions"), 1.0)
         return {"length": length, **means, "kl": kl}
+
+    def _load(self, positions: list[int], ids: list[int], fabric: Fabric) -> ScenarioBatch:
+        return batch_with_futures(self.scenarios, [ids[position] for position in positions]).to(fabric.device)
 
     def _simulate(self, batch: ScenarioBatch, purpose: str, fabric: Fabric) -> tuple[Rollouts, "_Recorder"]:
         recorder = _Recorder(needs_score=purpose == "direction")

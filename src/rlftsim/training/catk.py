@@ -15,10 +15,8 @@ Sources: Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic 
 """
 
 import copy
-import os
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool
@@ -26,14 +24,15 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, check_positive, given
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenarios
 from rlftsim.training.catk_rollouts import DEFAULT_NUM_CANDIDATES, Choice, Targets, roll_out_closest
-from rlftsim.training.closed_loop import predict_along
-from rlftsim.training.freezing import TrainedParts, freeze_untrained
-from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
-from rlftsim.training.imitation import ImitationConfig, Prediction, imitate
-from rlftsim.training.run import TrainingScenarios, as_scenarios, require_trainable
+from rlftsim.training.closed_loop import predict_targets
+from rlftsim.training.freezing import TrainedModules, freeze_untrained
+from rlftsim.training.goals import GoalConfig, check_goals, choose_goals
+from rlftsim.training.imitation import ImitationConfig, ImitationMethod, Imitator, Prediction
+from rlftsim.training.method import check_trainable
+from rlftsim.training.parallel import Fabric
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class CatkConfig(ImitationConfig):
     """Policy that rolls out: the present one, or as it was when the epoch began."""
     max_distance_lengths: float | None = None
     """A decision from farther off the log than so many lengths of its class's box does not count. None = all count."""
-    trained: TrainedParts = "decoder"
+    trained: TrainedModules = "decoder"
     """The parts a policy names for fine-tuning, its last layers, its goal encoder, or everything."""
     goal_probability: float = 0.0
     """Probability of an agent to have its logged endpoint as a goal; for a goal-conditioned policy."""
@@ -78,53 +77,39 @@ class RoadConfig(CatkConfig):
     rollouts_of: Literal["update", "epoch"] = "epoch"
 
 
-def catk_finetune(
-    policy: Policy,
-    scenarios: TrainingScenarios,
-    out: str | os.PathLike[str],
-    config: CatkConfig,
-    *,
-    held_out: TrainingScenarios | None = None,
-    card: str = "",
-) -> Path:
-    """Fine-tune a policy in place with CAT-K; resumes where a run in `out` was stopped.
+class CatkMethod(ImitationMethod[CatkConfig]):
+    """CAT-K. A batch is encoded once, with gradient; its rollout (dropout active, no gradient) and the pass that scores
+    the targets share that context, and the scoring pass draws a dropout of its own."""
 
-    A batch is encoded once, with gradient. Its rollout (dropout active, no gradient) and the pass that scores its
-    targets share that context; the scoring pass draws a dropout of its own.
+    settings = CatkConfig
+    title = "CAT-K"
 
-    Args:
-        policy: an nn.Module that implements `TokenPolicy`.
-        scenarios: a data set, a list or one scenario, with their futures.
-        out: the run's folder.
-        config: see its fields.
-        held_out: scenarios to validate on, see `config.validation`; None = no validation.
-        card: README of the resulting model folder.
+    def describe(self, settings: CatkConfig) -> str:
+        """CAT-K and the choice of its rollouts."""
+        return f"CAT-K, {settings.choice}"
 
-    Returns:
-        The model folder, `out/model`.
+    def start(self, policy: Any, scenarios: Scenarios, settings: CatkConfig, fabric: Fabric) -> Imitator:
+        """Learner of the trained parts of a `TokenPolicy`."""
+        check_trainable(policy, scenarios, self.title, needs=("vocabulary",))
+        check_goals(policy, settings.goal_probability)
+        freeze_untrained(policy, settings.trained)
+        learner = super().start(policy, scenarios, settings, fabric)
+        if settings.rollouts_of == "epoch":  # without dropout, as a policy that simulates
+            learner.frozen = copy.deepcopy(policy).eval().requires_grad_(False)
+        return learner
 
-    Raises:
-        ConfigError: the policy has no weights or no tokens, or there is no scenario.
-        CheckpointError: `out` holds another run, or the run diverged.
-        NotYetError: another run is at work in `out`.
-    """
-    scenarios = as_scenarios(scenarios)
-    method = "RoaD" if isinstance(config, RoadConfig) else "CAT-K"
-    model = require_trainable(policy, scenarios, method, needs=("vocabulary",))
-    refuse_goals(model, config.goal_probability)
-    freeze_untrained(model, config.trained)
-    goal_config = GoalConfig(probability=config.goal_probability)
-    # Without dropout, as a policy that simulates.
-    frozen = copy.deepcopy(model).eval().requires_grad_(False) if config.rollouts_of == "epoch" else None
-
-    def predict_along_catk(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
+    def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
+        """Predictions along rollouts near the log."""
+        model, config, update = learner.policy, learner.config, learner.update
         context = rollout_context = model.encode(batch)
         behavior = model
-        if frozen is not None:
-            before, now = (places * config.batch_size // len(scenarios) for places in (update - 1, update))
-            if now > before:
-                frozen.to(batch.device).load_state_dict(model.state_dict())
-            behavior, rollout_context = frozen, frozen.encode(batch)
+        if learner.frozen is not None:
+            behavior = learner.frozen
+            last, epoch = (count * config.batch_size // learner.num_scenarios for count in (update - 1, update))
+            if epoch > last:
+                behavior.load_state_dict(model.state_dict())
+            rollout_context = behavior.encode(batch)
+        goal_config = GoalConfig(probability=config.goal_probability)
         goals = choose_goals(batch, goal_config, None, seed=derive_seed(config.seed, "goals", update))
         targeted = roll_out_closest(
             behavior, batch, num_candidates=config.num_candidates, choice=config.choice, targets=config.targets,
@@ -133,10 +118,15 @@ def catk_finetune(
         )  # fmt: skip
         # Autocast keeps weights that it has cast, and those cast in the rollout have no gradient.
         torch.clear_autocast_cache()
-        return predict_along(model, context, targeted, trained)
+        return predict_targets(model, context, targeted, trained)
 
-    return imitate(
-        model, scenarios, out, config, predict_along_catk,
-        title=method, card=card, held_out=None if held_out is None else as_scenarios(held_out),
-        kept={} if frozen is None else {"frozen": frozen},
-    )  # fmt: skip
+
+class RoadMethod(CatkMethod):
+    """RoaD: CAT-K with other rollouts and targets, which its settings choose."""
+
+    settings = RoadConfig
+    title = "RoaD"
+
+    def describe(self, settings: CatkConfig) -> str:
+        """RoaD."""
+        return self.title

@@ -61,14 +61,14 @@ def roll_out_closest(
     Args:
         policy: decides for every agent.
         batch: scenarios with their future.
-        num_candidates: K.
+        num_candidates: Number K of candidate tokens of each decision, at least 1.
         choice: see `Choice`.
         targets: see `Targets`.
         max_distance_lengths: see `CatkConfig`.
-        num_rollouts: N.
-        seed: of what else is random in the policy, and of samples.
+        num_rollouts: Number N of rollouts of each scenario.
+        seed: Seed of the samples and of what else is random in the policy.
         context: `policy.encode(batch)`, if it has been computed.
-        goals: of the agents, see `simulate`.
+        goals: Goals of the agents, as `simulate` takes them; None = goal-free.
         catk_compat: round where the public code rounds, see `tokens.catk_compat`.
 
     Returns:
@@ -82,7 +82,7 @@ def roll_out_closest(
         raise ConfigError(f"num_candidates must be at least 1, got {num_candidates}.")
     # The log in steps of one token, 0.5 s: poses and validity, [B, A, tokens].
     tokens = tokenize_agents(batch, policy.vocabulary, catk_compat=catk_compat)
-    found: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]
+    decision_targets: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]
     logged = _targets(batch, tokens, policy.vocabulary, catk_compat)
     take = _CHOICES[choice]
     # K numbers for each decision of an agent in place of one, as independent of the batch as those of `simulate`
@@ -98,10 +98,10 @@ def roll_out_closest(
         target = next(logged)((state.position, state.heading))
         if choice == "sampled":
             noise = next(draw)
-        taken = take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
-        best = taken if targets == "taken" else target.best_token()
-        found.append((best, target.logged_valid & target.is_near_log(max_distance_lengths)))
-        return taken
+        decision = take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
+        best = decision if targets == "taken" else target.best_token()
+        decision_targets.append((best, target.logged_valid & target.is_near_log(max_distance_lengths)))
+        return decision
 
     rollouts = simulate(
         policy,
@@ -113,7 +113,7 @@ def roll_out_closest(
         choose=choose,
         may_be_nan=True,
     )
-    target, mask = (torch.stack(part, -1) for part in zip(*found))  # [B, N, A, L]
+    target, mask = (torch.stack(steps, -1) for steps in zip(*decision_targets))  # [B, N, A, L]
     return TargetedRollouts(rollouts, target, mask, class_of_type(batch.object_type))
 
 
@@ -122,8 +122,8 @@ class _Target:
     """Poses of the agents in a simulation, and the logged ones of the same step and of the next."""
 
     pose: Pose
-    logged_now: Pose
-    logged_now_valid: Bool[Tensor, "B N A"]
+    logged_start: Pose
+    logged_start_valid: Bool[Tensor, "B N A"]
     logged: Pose
     """Of the next step: where the decision should lead."""
     logged_valid: Bool[Tensor, "B N A"]
@@ -141,8 +141,8 @@ class _Target:
         if max_lengths is None:
             return torch.ones_like(self.logged_valid)
         length, _ = box_of_class(self.class_id)
-        distance = (self.pose[0] - self.logged_now[0]).norm(dim=-1)  # [B, N, A]
-        return (distance <= max_lengths * length) | ~self.logged_now_valid
+        distance = (self.pose[0] - self.logged_start[0]).norm(dim=-1)  # [B, N, A]
+        return (distance <= max_lengths * length) | ~self.logged_start_valid
 
     def distances(self, ids: Int64[Tensor, "R K"], mask: Bool[Tensor, "B N A"]) -> Float[Tensor, "R K"]:
         """Mean corner distances, m, between the boxes that tokens lead to and the logged boxes.
@@ -169,20 +169,20 @@ def _targets(
     """Yield for each decision the function from the simulation's poses to their targets."""
     for step in range(HISTORY_TOKENS, tokens.logged_valid.shape[-1]):
 
-        def target_of(pose: Pose, step: int = step) -> _Target:
+        def make_target(pose: Pose, step: int = step) -> _Target:
             def at(values: Tensor, step: int) -> Tensor:
                 values = values[:, None, :, step]  # the log is the same for all N rollouts
                 return values.expand(-1, pose[1].shape[1], *values.shape[2:])
 
             # The decision leads from the token before `step` to that at `step`.
-            now, then = ((at(tokens.logged_position, k), at(tokens.logged_heading, k)) for k in (step - 1, step))
+            start, end = ((at(tokens.logged_position, k), at(tokens.logged_heading, k)) for k in (step - 1, step))
             class_id = class_of_type(batch.object_type)[:, None].expand(pose[1].shape)
             return _Target(
-                pose, now, at(tokens.logged_valid, step - 1), then, at(tokens.logged_valid, step), class_id, vocabulary,
-                catk_compat,
+                pose, start, at(tokens.logged_valid, step - 1), end, at(tokens.logged_valid, step), class_id,
+                vocabulary, catk_compat,
             )  # fmt: skip
 
-        yield target_of
+        yield make_target
 
 
 def _take_closest(distribution: TokenLogits, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
@@ -198,17 +198,17 @@ def _draw_likely(distribution: Any, target: _Target, count: int, noise: Tensor) 
     return distribution.sample(Sampling(top_k=count), noise)
 
 
-def _draw_near(distribution: Any, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
+def _draw_neighbor(distribution: Any, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
     logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
     ids = torch.arange(logits.shape[-1], device=logits.device).expand_as(logits)
     # a class may have fewer tokens than the table has rows
     exists = target.vocabulary.token_mask[pick_rows(target.class_id, mask, is_dense=len(logits) == mask.numel())]
-    near = target.distances(ids, mask).masked_fill(~exists, torch.inf)
-    near = near.topk(min(count, logits.shape[-1]), dim=-1, largest=False).indices  # [R, K]
-    kept = torch.zeros_like(logits, dtype=torch.bool).scatter(-1, near, True)
+    neighbors = target.distances(ids, mask).masked_fill(~exists, torch.inf)
+    neighbors = neighbors.topk(min(count, logits.shape[-1]), dim=-1, largest=False).indices  # [R, K]
+    is_candidate = torch.zeros_like(logits, dtype=torch.bool).scatter(-1, neighbors, True)
     # -inf removes a token from the softmax; the others keep their relative probabilities.
-    among_near = replace(distribution, logits=logits.masked_fill(~kept, -torch.inf)).sample(Sampling(), noise)
-    return torch.where(target.logged_valid, among_near, _draw_likely(distribution, target, count, noise))
+    neighbor = replace(distribution, logits=logits.masked_fill(~is_candidate, -torch.inf)).sample(Sampling(), noise)
+    return torch.where(target.logged_valid, neighbor, _draw_likely(distribution, target, count, noise))
 
 
 def _take_nearest_sample(
@@ -220,10 +220,10 @@ def _take_nearest_sample(
     ids = torch.searchsorted(cumulative, noise[mask] * cumulative[:, -1:], right=True)  # [R, K]
     ids = ids.clamp(max=logits.shape[-1] - 1)
     nearest = target.distances(ids, mask).argmin(-1, keepdim=True)
-    chosen = torch.where(target.logged_valid[mask], ids.gather(-1, nearest)[:, 0], ids[:, 0])
-    return torch.zeros_like(target.class_id).masked_scatter(mask, chosen)
+    decision = torch.where(target.logged_valid[mask], ids.gather(-1, nearest)[:, 0], ids[:, 0])
+    return torch.zeros_like(target.class_id).masked_scatter(mask, decision)
 
 
 _CHOICES = {
-    "closest": _take_closest, "top_k": _draw_likely, "trajeglish": _draw_near, "sampled": _take_nearest_sample,
+    "closest": _take_closest, "top_k": _draw_likely, "trajeglish": _draw_neighbor, "sampled": _take_nearest_sample,
 }  # fmt: skip

@@ -20,7 +20,7 @@ from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import errors_name, remove_folder, save_tensors, write_text
 
 PREFIX = "update-"
-KEPT = 2
+NUM_CHECKPOINTS = 2
 """Number of checkpoints that are kept; older ones are removed."""
 
 
@@ -62,7 +62,7 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
         remove_folder(target, files)
         partial.rename(target)
         # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
-        for old in _checkpoints(folder)[:-KEPT]:
+        for old in _checkpoints(folder)[:-NUM_CHECKPOINTS]:
             remove_folder(old, files)
     return target
 
@@ -77,7 +77,7 @@ def _checkpoints(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob(f"{PREFIX}*") if path.name.removeprefix(PREFIX).isdecimal())
 
 
-def update_of(path: Path) -> int:
+def parse_update(path: Path) -> int:
     """Updates that a run had done at a checkpoint."""
     return int(path.name.removeprefix(PREFIX))
 
@@ -86,9 +86,9 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     """Load weights and moments in place.
 
     Args:
-        path: of the checkpoint.
-        modules: as they were given to `write_checkpoint`.
-        optimizer: of the same parameters in the same order; keeps its own learning rate.
+        path: Folder of the checkpoint, named after its update.
+        modules: Modules by the names that `write_checkpoint` got; weights are loaded in place.
+        optimizer: Optimizer with the same parameters in the same order; the learning rate stays.
 
     Returns:
         The position of the run.
@@ -102,10 +102,10 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         # everything is checked before anything is loaded
         weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
         moments = _read(path / "optimizer.safetensors", way_out)
-        _check_progress(values, update_of(path))
+        _check_progress(values, parse_update(path))
         for name, module in modules.items():
             _check_weights(name, weights[name], module)
-        state = _state_of_moments(moments, optimizer)
+        state = _parse_moments(moments, optimizer)
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: {Path(error.filename or '').name or 'a file'} is missing: {way_out}.") from None
     except ValueError as error:
@@ -143,19 +143,19 @@ def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) 
     Raises:
         ValueError: Another name, shape or dtype, or a weight that is not finite.
     """
-    own = module.state_dict()
-    if own.keys() != weights.keys():
-        raise ValueError(f"{name} lacks or adds {min(own.keys() ^ weights.keys())[:80]!r}")
+    state = module.state_dict()
+    if state.keys() != weights.keys():
+        raise ValueError(f"{name} lacks or adds {min(state.keys() ^ weights.keys())[:80]!r}")
     for key, value in weights.items():
-        if (value.shape, value.dtype) != (own[key].shape, own[key].dtype):
-            wanted = f"{own[key].dtype} {tuple(own[key].shape)}"
-            raise ValueError(f"{key} of {name} is {value.dtype} {tuple(value.shape)}, not {wanted}")
-    for key in own.keys() & dict(module.named_parameters()).keys():
+        if (value.shape, value.dtype) != (state[key].shape, state[key].dtype):
+            expected = f"{state[key].dtype} {tuple(state[key].shape)}"
+            raise ValueError(f"{key} of {name} is {value.dtype} {tuple(value.shape)}, not {expected}")
+    for key in state.keys() & dict(module.named_parameters()).keys():
         if not weights[key].isfinite().all():
             raise ValueError(f"{key} of {name} is not finite")
 
 
-def _state_of_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> dict[int, dict[str, Tensor]]:
+def _parse_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> dict[int, dict[str, Tensor]]:
     """State of an optimizer by number of the parameter.
 
     Raises:
@@ -173,7 +173,7 @@ def _state_of_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> di
         if not value.is_floating_point() or not value.isfinite().all():
             raise ValueError(f"{key[:80]!r} is not finite, or no number")
         state.setdefault(index, {})[name] = value
-    names = {frozenset(one) for one in state.values()}
+    names = {frozenset(moments_by_name) for moments_by_name in state.values()}
     if len(names) > 1:
         raise ValueError("some weights lack moments that others have")
     return state

@@ -43,7 +43,7 @@ class ClosedLoopPrediction:
     class_id: Int64[Tensor, "R"]
 
 
-def predict_along(
+def predict_targets(
     policy: TokenPolicy, context: Any, targeted: TargetedRollouts, trained: Bool[Tensor, "B A"]
 ) -> ClosedLoopPrediction:
     """Predictions along rollouts: differentiable, one parallel pass.
@@ -58,5 +58,5 @@ def predict_along(
     counts = targeted.target_mask & targeted.rollouts.decision_mask & trained[:, None, :, None]  # [B, N, A, L]
     class_id = targeted.class_id[:, None, :, None].expand(counts.shape)
     # The distribution has a row for each element of its mask only: pick the same ones, in the same order.
-    place = find_rows(dist.mask, is_dense=len(dist.logits) == dist.mask.numel())
-    return ClosedLoopPrediction(dist.logits, *(values[place] for values in (targeted.target, counts, class_id)))
+    rows = find_rows(dist.mask, is_dense=len(dist.logits) == dist.mask.numel())
+    return ClosedLoopPrediction(dist.logits, *(values[rows] for values in (targeted.target, counts, class_id)))

@@ -20,32 +20,32 @@ from rlftsim.training.experience import simulated_speeds
 class Constraint:
     """A sum over agents, of which the mean over rollouts is held, or the least."""
 
-    parts: Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
+    shares: Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
     """Part of each agent in each rollout; they are summed over agents."""
     is_minimum: bool = False
     """True = the value is that of the rollout with the least sum."""
 
-    def value(self, parts: Float[Tensor, "B N A"]) -> Float[Tensor, "B"]:
+    def value(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B"]:
         """Value in each scenario."""
-        total = parts.sum(-1)
+        total = shares.sum(-1)
         return total.amin(1) if self.is_minimum else total.mean(1)
 
-    def credit(self, parts: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
+    def credit(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
         """What an agent's decisions in a rollout add to the value.
 
         Summed with their score functions over rollouts and agents it is an estimate of the value's gradient, without
         bias where no agent's part depends on other agents.
         """
         if not self.is_minimum:
-            return against_others(parts / parts.shape[1])
+            return subtract_baseline(shares / shares.shape[1])
         # Without the rollout of the least sum the value is the second one, without any other it is what it was.
-        first, second = parts.sum(-1).topk(2, dim=1, largest=False).indices.unbind(1)  # [B]
-        row, added = torch.arange(len(parts), device=parts.device), torch.zeros_like(parts)
-        added[row, first] = parts[row, first] - parts[row, second]
+        first, second = shares.sum(-1).topk(2, dim=1, largest=False).indices.unbind(1)  # [B]
+        row, added = torch.arange(len(shares), device=shares.device), torch.zeros_like(shares)
+        added[row, first] = shares[row, first] - shares[row, second]
         return added
 
 
-def against_others(added: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
+def subtract_baseline(added: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
     """Contributions of rollouts minus the mean of the other rollouts' contributions.
 
     Where these depend on the rollout itself, as in `mloo`, its score function times the result is the gradient to first

@@ -11,6 +11,7 @@ from torch import Tensor
 from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.mirror import mirrored
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
@@ -29,24 +30,24 @@ def batch_with_futures(
     """Batch of some scenarios.
 
     Args:
-        scenarios: to choose from.
-        indices: of the chosen ones.
+        scenarios: Training scenarios, which the indices count.
+        indices: Indices of the scenarios of the batch, in its order.
         context_radius_m: leave out steps farther from the ego, see `within_reach`; None = leave out nothing.
         mirror: indices of those that are seen mirrored.
 
     Raises:
         DataError: one of them withholds its future, so nothing can be learned from it.
     """
-    chosen = [mirrored(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
-    for scenario in chosen:
+    selected = [mirrored(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
+    for scenario in selected:
         if not scenario.has_future:
             raise DataError(
                 f"scenario {scenario.scenario_id} has {scenario.num_steps} logged steps, its future is withheld: "
                 "train on the training split."
             )
     if context_radius_m is not None:
-        chosen = [within_reach(scenario, context_radius_m) for scenario in chosen]
-    return collate(chosen)
+        selected = [within_reach(scenario, context_radius_m) for scenario in selected]
+    return collate(selected)
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:
@@ -56,7 +57,7 @@ def within_reach(scenario: Scenario, radius_m: float) -> Scenario:
     nothing is left out.
 
     Args:
-        scenario: with any number of steps.
+        scenario: Scenario with any number of logged steps.
         radius_m: 3-D distance.
 
     Returns:
@@ -70,8 +71,10 @@ def _without_far_steps(scenario: Scenario, radius_m: float) -> Scenario | None:
     """None where all is within reach: a cache on the scenario must not hold the scenario, or neither is freed."""
     tracks, ego = scenario.tracks, scenario.ego_index
     distance_m = np.linalg.norm(tracks.position - tracks.position[ego], axis=-1)  # [agents, steps]
-    far = (distance_m >= radius_m) & tracks.valid & tracks.valid[ego]
-    return replace(scenario, tracks=replace(tracks, valid=tracks.valid & ~far)) if far.any() else None
+    is_out_of_reach = (distance_m >= radius_m) & tracks.valid & tracks.valid[ego]
+    if not is_out_of_reach.any():
+        return None
+    return replace(scenario, tracks=replace(tracks, valid=tracks.valid & ~is_out_of_reach))
 
 
 def trained_agents(
@@ -83,11 +86,11 @@ def trained_agents(
     batch.
 
     Args:
-        batch: with its future.
+        batch: Scenarios with their logged futures.
         update: counted from 0.
         radius_m: distance from the ego at the current step up to which the others are taken.
-        limit: of a scenario; None = all.
-        seed: of the run.
+        limit: Largest number of trained agents in a scenario; None = no limit.
+        seed: Seed of the run; equal seeds, equal choices.
     """
     interest = torch.zeros_like(batch.agent_mask)  # [B, A]
     for row, scenario, ids in zip(interest, batch.scenarios, batch.object_id):
@@ -100,18 +103,18 @@ def trained_agents(
     is_ego = (batch.object_id == ego_id[:, None]) & batch.agent_mask
     position = torch.cat([batch.position[:, :, CURRENT_STEP], batch.z[:, :, CURRENT_STEP, None]], -1)  # [B, A, 3]
     ego = (position * is_ego[..., None]).sum(1, keepdim=True)  # [B, 1, 3]
-    is_near = (position - ego).norm(dim=-1) < radius_m
-    others = is_near & has_future & batch.agent_mask & ~first
+    is_within_radius = (position - ego).norm(dim=-1) < radius_m
+    candidates = is_within_radius & has_future & batch.agent_mask & ~first
     if limit is None:
-        return first | others
-    u = torch.zeros(others.shape)
+        return first | candidates
+    u = torch.zeros(candidates.shape)
     for row, scenario in zip(u, batch.scenarios):
         # One generator per scenario: padding and neighbors in the batch change nothing.
         generator = torch.Generator().manual_seed(derive_seed(seed, "agents", update, scenario.scenario_id) % 2**63)
         count = len(scenario.simulated_indices)
         row[:count] = torch.rand(count, generator=generator)
-    rank = torch.where(others, u.to(batch.device), 2.0).argsort(-1).argsort(-1)  # 2 is behind every uniform number
-    return first | (others & (rank < limit - first.sum(-1, keepdim=True)))
+    rank = torch.where(candidates, u.to(batch.device), 2.0).argsort(-1).argsort(-1)  # 2 is behind every uniform number
+    return first | (candidates & (rank < limit - first.sum(-1, keepdim=True)))
 
 
 def mirrored_of_update(update: int, indices: Sequence[int], probability: float, seed: int) -> set[int]:
@@ -119,9 +122,9 @@ def mirrored_of_update(update: int, indices: Sequence[int], probability: float, 
 
     Args:
         update: counted from 0.
-        indices: of the scenarios.
-        probability: of each to be mirrored.
-        seed: of the run.
+        indices: Indices of the scenarios of the update.
+        probability: Chance in [0, 1] that a scenario is mirrored.
+        seed: Seed of the run; equal seeds, equal choices.
     """
     return {i for i in indices if np.random.default_rng(derive_seed(seed, "mirror", update, i)).random() < probability}
 
@@ -132,14 +135,28 @@ def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: 
     Args:
         update: counted from 0.
         batch_size: scenarios per update over all processes.
-        num_scenarios: in the data set.
-        seed: of the run.
+        num_scenarios: Number of scenarios in the data set.
+        seed: Seed of the run; equal seeds, equal choices.
     """
     # Positions in the endless sequence of epochs after epochs.
-    places = range(update * batch_size, (update + 1) * batch_size)
+    positions = range(update * batch_size, (update + 1) * batch_size)
     # A batch may reach over the end of an epoch, so it may need more than one order.
     orders = {
         epoch: np.random.default_rng(derive_seed(seed, "order", epoch)).permutation(num_scenarios)
-        for epoch in {p // num_scenarios for p in places}
+        for epoch in {p // num_scenarios for p in positions}
     }
-    return [int(orders[p // num_scenarios][p % num_scenarios]) for p in places]
+    return [int(orders[p // num_scenarios][p % num_scenarios]) for p in positions]
+
+
+def share_cache(scenarios: Scenarios, num_processes: int) -> Scenarios:
+    """Scenarios of which each process keeps its share in memory, where the process cannot keep all.
+
+    Args:
+        scenarios: Training scenarios; a list, which is in memory already, stays as it is.
+        num_processes: Processes that share a memory.
+    """
+    if not isinstance(scenarios, ScenarioDataset) or num_processes == 1:
+        return scenarios
+    if len(scenarios) * num_processes <= scenarios.cache_size:
+        return scenarios
+    return ScenarioDataset(scenarios.folder, scenarios.split, cache_size=max(scenarios.cache_size // num_processes, 1))

@@ -34,7 +34,7 @@ class Experience:
     rewards: Rewards
     context: Any = None
     """Of the batch, made without gradient by the policy that rolled out; None = there is none to share."""
-    own: range | None = None
+    rollout_ids: range | None = None
     """Rollouts that this process scores with gradient, where several have the same scenarios; None = all."""
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
@@ -43,10 +43,10 @@ class Experience:
         Args:
             size: rollouts of a scenario at a time, so that few are in memory with their gradient.
         """
-        own = self.own or range(self.rollouts.num_rollouts)
-        for start in own[::size]:
-            part = slice(start, min(start + size, own.stop))
-            yield self.rollouts.select(part), self.rewards.by_agent[:, part]
+        rollout_ids = self.rollout_ids or range(self.rollouts.num_rollouts)
+        for start in rollout_ids[::size]:
+            rows = slice(start, min(start + size, rollout_ids.stop))
+            yield self.rollouts.select(rows), self.rewards.by_agent[:, rows]
 
 
 # ---- sampling and rewards ------------------------------------------------------------------------------------------
@@ -59,7 +59,7 @@ def sample_rollouts(
     augmented: StoredGoals | None,
     *,
     num_rollouts: int,
-    own: range,
+    rollout_ids: range,
     seed: int,
     update: int,
     fabric: Fabric,
@@ -69,44 +69,44 @@ def sample_rollouts(
     Args:
         policy: decides for all agents.
         batch: scenarios with their futures.
-        goals: probabilities of goals.
+        goals: Settings of goals: probability of an agent to have one.
         augmented: goals beside the logged endpoints, if there are any.
         num_rollouts: N, of each scenario.
-        own: those of them that this process simulates; the others come from the processes that have the same scenarios.
-        seed: of the run.
-        update: counted from 0; with the seed it determines goals and rollouts.
+        rollout_ids: Rollouts that this process simulates; the rest comes from the processes with the same scenarios.
+        seed: Seed of the run; with `update` it determines goals and rollouts.
+        update: Number of the update, from 0.
         fabric: precision of the pass, and the processes.
     """
-    chosen = choose_goals(batch, goals, augmented, seed=derive_seed(seed, "goals", update))
+    batch_goals = choose_goals(batch, goals, augmented, seed=derive_seed(seed, "goals", update))
     with fabric.autocast(), torch.no_grad(), one_thread():
         context = policy.encode(batch)
         rollouts = simulate(
             policy,
             batch,
-            num_rollouts=own,
+            num_rollouts=rollout_ids,
             seed=derive_seed(seed, "rollouts", update),
             context=context,
-            goals=chosen,
+            goals=batch_goals,
             may_be_nan=True,
         )
-    if len(own) < num_rollouts:
+    if len(rollout_ids) < num_rollouts:
         rollouts = _gather_rollouts(rollouts, num_rollouts, fabric)
     return context, rollouts
 
 
-def _gather_rollouts(own: Rollouts, num_rollouts: int, fabric: Fabric) -> Rollouts:
+def _gather_rollouts(rollouts: Rollouts, num_rollouts: int, fabric: Fabric) -> Rollouts:
     """All rollouts of the scenarios that several processes share, in their order and the same bits in each of them.
 
     Rewards compare the rollouts of a scenario with each other, so each process needs them all. They are small.
     """
-    names = [field.name for field in fields(own) if isinstance(getattr(own, field.name), Tensor)]
-    everything = all_gather({name: getattr(own, name) for name in names}, fabric)
-    sharing = num_rollouts // own.num_rollouts
+    names = [field.name for field in fields(rollouts) if isinstance(getattr(rollouts, field.name), Tensor)]
+    gathered = all_gather({name: getattr(rollouts, name) for name in names}, fabric)
+    sharing = num_rollouts // rollouts.num_rollouts
     first = fabric.global_rank - fabric.global_rank % sharing
-    parts = everything[first : first + sharing]
-    joined: dict[str, Any] = {name: torch.cat([part[name] for part in parts], 1) for name in names}
-    goals = own.goals and own.goals.rollouts(slice(1)).repeat(num_rollouts)
-    return replace(own, **joined, goals=goals)
+    groups = gathered[first : first + sharing]
+    joined: dict[str, Any] = {name: torch.cat([tensors[name] for tensors in groups], 1) for name in names}
+    goals = rollouts.goals and rollouts.goals.rollouts(slice(1)).repeat(num_rollouts)
+    return replace(rollouts, **joined, goals=goals)
 
 
 def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
@@ -116,7 +116,7 @@ def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneCon
 
     Args:
         batch: scenarios with their futures.
-        rollouts: N of each.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
         config: reward, metric and credit assignment.
     """
     metric = metric_by_name(config.metric)
@@ -135,8 +135,8 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
     metric rewards driving slowly.
 
     Args:
-        experiences: of this process.
-        fabric: the processes.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        fabric: Processes of the run, over which sums are added.
 
     Returns:
         The experiences with other rewards by agent, and the slope that was removed, reward per m/s.
@@ -148,33 +148,33 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
         mean_speed = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
         deviation = torch.nan_to_num(mean_speed - mean_speed.mean(1, keepdim=True), 0.0, 0.0, 0.0)
         # A scenario of which no reward is known earns 0, and has no part in the regression.
-        is_known = ~experience.rewards.is_missing.all(0)  # [B]
-        deviation = deviation * is_known[:, None, None]
+        has_reward = ~experience.rewards.is_missing.all(0)  # [B]
+        deviation = deviation * has_reward[:, None, None]
         sums += torch.stack([(deviation * experience.rewards.by_agent).sum(), deviation.square().sum()])
         deviations.append(deviation)
     # One slope for all processes, or their gradients would not add up to that of one process.
     explained, total = all_reduce_sum(sums, fabric).tolist()
     slope = explained / total if total > 0 else 0.0
-    held = [
+    adjusted = [
         replace(e, rewards=replace(e.rewards, by_agent=(e.rewards.by_agent - slope * deviation).float()))
         for e, deviation in zip(experiences, deviations, strict=True)
     ]
-    return held, slope
+    return adjusted, slope
 
 
 def count_decisions(experiences: Sequence[Experience], fabric: Fabric) -> tuple[int, float]:
     """Number of scenarios and of decisions in the whole batch, those of other processes included.
 
     Args:
-        experiences: of this process.
-        fabric: the processes.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        fabric: Processes of the run, over which sums are added.
     """
     totals = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     for experience in experiences:
-        own = experience.own or range(experience.rollouts.num_rollouts)
+        rollout_ids = experience.rollout_ids or range(experience.rollouts.num_rollouts)
         # Of processes with the same scenarios, the one with the first rollouts counts these.
-        num_scenarios = experience.batch.num_scenarios if own.start == 0 else 0
-        num_decisions = experience.rollouts.decision_mask[:, own.start : own.stop].sum()
+        num_scenarios = experience.batch.num_scenarios if rollout_ids.start == 0 else 0
+        num_decisions = experience.rollouts.decision_mask[:, rollout_ids.start : rollout_ids.stop].sum()
         totals += torch.stack([torch.tensor(num_scenarios, device=fabric.device), num_decisions])
     num_scenarios, num_decisions = all_reduce_sum(totals, fabric).tolist()
     return int(num_scenarios), num_decisions
@@ -189,15 +189,19 @@ def describe(experiences: Sequence[Experience], fabric: Fabric) -> dict[str, flo
     A scenario without a finite value is left out of that mean.
 
     Args:
-        experiences: of this process.
-        fabric: the processes.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        fabric: Processes of the run, over which sums are added.
     """
-    parts = [describe_scenarios(experience) for experience in experiences]
-    values = torch.stack([torch.cat([part[name] for part in parts]).double() for name in parts[0]])  # [metrics, B]
+    metrics = [describe_scenarios(experience) for experience in experiences]
+    values = torch.stack(
+        [torch.cat([scenario_metrics[name] for scenario_metrics in metrics]).double() for name in metrics[0]]
+    )  # [metrics, B]
     # Sums and counts travel, not means: processes may have different numbers of scenarios.
-    known = values.isfinite()
-    sums = all_reduce_sum(torch.stack([torch.where(known, values, 0.0).sum(-1), known.sum(-1).double()]), fabric)
-    return dict(zip(parts[0], (sums[0] / sums[1]).tolist()))
+    is_finite = values.isfinite()
+    sums = all_reduce_sum(
+        torch.stack([torch.where(is_finite, values, 0.0).sum(-1), is_finite.sum(-1).double()]), fabric
+    )
+    return dict(zip(metrics[0], (sums[0] / sums[1]).tolist()))
 
 
 def describe_scenarios(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
@@ -211,7 +215,7 @@ def describe_scenarios(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
     }
     for term, values, is_missing in zip(rewards.terms, rewards.by_term, rewards.is_missing):
         metrics |= {f"reward_{term.name}_mean": values.mean(-1), f"reward_{term.name}_std": values.std(-1)}
-        metrics[missing_rate_of(term)] = is_missing.double()
+        metrics[missing_rate_name(term)] = is_missing.double()
     metrics |= describe_goals(experience)
     metrics |= {
         "rmm": realism.meta_metric,
@@ -229,7 +233,7 @@ def describe_scenarios(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
     return metrics
 
 
-def missing_rate_of(term: Term) -> str:
+def missing_rate_name(term: Term) -> str:
     """Name of the metric for the fraction of scenarios in which a term of the reward is not finite."""
     return f"reward_{term.name}_missing_rate"
 
@@ -243,8 +247,8 @@ def describe_goals(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
     if goals is None:
         return {}
     mask = goals.goal_mask & experience.batch.evaluated_mask[:, None]  # [B, N, A]
-    ways = {"goal_reached_rate": is_reached, "goal_passed_rate": is_passed}
-    return {name: rate(is_met(rollouts.position, goals), mask).mean(-1) for name, is_met in ways.items()}
+    criteria = {"goal_reached_rate": is_reached, "goal_passed_rate": is_passed}
+    return {name: rate(is_met(rollouts.position, goals), mask).mean(-1) for name, is_met in criteria.items()}
 
 
 def compute_diversity(rollouts: Rollouts) -> Float[Tensor, "B"]:
@@ -261,7 +265,7 @@ def compute_speed_gap(batch: ScenarioBatch, rollouts: Rollouts) -> Float[Tensor,
 
     Args:
         batch: scenarios with their logged tracks.
-        rollouts: N of each.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
 
     Returns:
         NaN for a scenario with no logged future.
@@ -278,7 +282,7 @@ def simulated_speeds(
 
     Args:
         batch: scenarios with their logged tracks.
-        rollouts: N of each.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
     """
     future, valid = slice(CURRENT_STEP + 1, None), batch.valid
     # A speed is the way of one step, so both of its ends have to be valid: [B, A, T].
@@ -301,7 +305,7 @@ class UpdateClock:
         # CUDA runs behind Python: without waiting, a lap would be charged to the next one.
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
-        now = time.perf_counter()
+        current = time.perf_counter()
         name = f"seconds_{name}"
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now
+        self.seconds[name] = self.seconds.get(name, 0.0) + current - self._last
+        self._last = current

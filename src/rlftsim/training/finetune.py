@@ -1,19 +1,18 @@
 """Closed-loop fine-tuning with rewards: sample, reward, score, update, sync the reference (RLFTSim, section 4).
 
-`finetune` is the main path of this package; `update_policy` is one update of it, in seven steps.
+The main path of this package; `update_policy` is one update of it, in seven steps.
 """
 
 import copy
 import math
-import os
-from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
 
 from rlftsim.rewards import parse_reward
-from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenarios
 from rlftsim.training.experience import (
     Experience,
     UpdateClock,
@@ -21,91 +20,63 @@ from rlftsim.training.experience import (
     count_decisions,
     describe,
     hold_speed,
-    missing_rate_of,
+    missing_rate_name,
     sample_rollouts,
 )
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.freezing import (
+    check_entropy,
     freeze_untrained,
     parameter_groups,
-    refuse_constant_entropy,
+    select_trained_modules,
     set_learning_rate,
-    trained_parts,
 )
-from rlftsim.training.goals import StoredGoals, refuse_goals
+from rlftsim.training.goals import StoredGoals, check_goals
 from rlftsim.training.hindsight import accumulate_hindsight
+from rlftsim.training.method import Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.parallel import Fabric, all_reduce_gradients, local_rollouts, num_sharing_memory
 from rlftsim.training.policy_gradient import LossTerms, accumulate_gradients
 from rlftsim.training.reference import RewardLearner, adapt_beta, sync_reference
-from rlftsim.training.run import (
-    TrainingRun,
-    TrainingScenarios,
-    UpdateReport,
-    as_scenarios,
-    require_trainable,
-    train_in_processes,
-)
 
 
-def finetune(
-    policy: Policy, scenarios: TrainingScenarios, out: str | os.PathLike[str], config: FinetuneConfig, *, card: str = ""
-) -> Path:
-    """Fine-tune a policy in place with rewards; resumes where a run in `out` was stopped, or ended with fewer epochs.
+class RewardMethod(Method[FinetuneConfig]):
+    """Policy gradient on rewards ("rlft")."""
 
-    Args:
-        policy: an nn.Module that implements `rollout.policy.Policy` and has `save_pretrained`.
-        scenarios: a data set, a list or one scenario, with their futures.
-        out: the run's folder.
-        config: see its fields.
-        card: README of the resulting model folder.
+    settings = FinetuneConfig
+    title = "fine-tune"
 
-    Returns:
-        The model folder, `out/model`.
+    def describe(self, settings: FinetuneConfig) -> str:
+        """The reward."""
+        return settings.reward
 
-    Raises:
-        ConfigError: the policy has no weights or is not goal-conditioned as the settings want, or there is no scenario.
-        DataError: a scenario has no logged future or no evaluated agent.
-        CheckpointError: `out` holds another run, or the run diverged (its last good checkpoint is named).
-        NotYetError: another run is at work in `out`.
-    """
-    scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0, rewarded=True)
-    trained_parts(model, config.trained)  # refuses what the policy does not have, before the folder is claimed
-    refuse_goals(policy, config.goals.probability)
-    augmented = config.goals.open_augmented(scenarios)
-    if config.entropy_bonus:
-        refuse_constant_entropy(model, scenarios[0], config.trained)
+    def start(self, policy: Any, scenarios: Scenarios, settings: FinetuneConfig, fabric: Fabric) -> RewardLearner:
+        """Check the policy, open augmented goals, and `prepare`."""
+        check_trainable(policy, scenarios, "rewards", is_imitated=settings.imitation_weight > 0, is_rewarded=True)
+        select_trained_modules(policy, settings.trained)
+        check_goals(policy, settings.goals.probability)
+        augmented = settings.goals.open_augmented(scenarios)
+        if settings.entropy_bonus:
+            check_entropy(policy, scenarios[0], settings.trained)
+        return prepare(policy, settings, fabric.device, augmented)
 
-    def train(config: FinetuneConfig, fabric: Fabric) -> Path:
-        run = TrainingRun(
-            policy, scenarios, out, config, fabric,
-            inputs={"augmented_goals": augmented.fingerprint} if augmented else {}, num_rollouts=config.num_rollouts,
-            skip_rule=f"KL above max_kl={config.max_kl} or not finite",
-            remedy="lower learning_rate or raise kl.initial_beta",
-            may_grow=("epochs",),  # the learning rate is constant: a longer run passes through the same weights
-        )  # fmt: skip
-        learner = prepare(model, config, fabric.device, augmented)
-        unwarned = list(parse_reward(config.reward))
-
-        def make_update() -> UpdateReport:
-            batch = run.local_batch(learner.update).to(fabric.device)
-            values = update_policy(learner, batch, config, fabric)
-            levels, alarms = learner.alarms.watch(values, config.alarms)
-            if learner.update == 1 and (values["reward_zero_rate"] == 1 or values["gradient_norm"] == 0):
-                alarms.append(f"no reward reached a trained weight (RMM {values['rmm']:.3f})")
-            for term in [term for term in unwarned if values[missing_rate_of(term)]]:
-                unwarned.remove(term)
-                count = round(values[missing_rate_of(term)] * config.batch_size)
+    def update(self, learner: RewardLearner, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
+        """One `update_policy`, with the messages that it gives rise to."""
+        config = learner.config
+        values = update_policy(learner, scenarios.batch(config.num_rollouts), config, fabric)
+        levels, alarms = learner.alarms.watch(values, config.alarms)
+        if learner.update == 1 and (values["reward_zero_rate"] == 1 or values["gradient_norm"] == 0):
+            alarms.append(f"no reward reached a trained weight (RMM {values['rmm']:.3f})")
+        for term in parse_reward(config.reward):
+            rate = values[missing_rate_name(term)]
+            if rate and term.name not in learner.warned_terms:
+                learner.warned_terms.add(term.name)
+                count = round(rate * config.batch_size)
                 alarms.append(f"reward {term}: not finite in {count} of {config.batch_size} scenarios, counted as 0")
-            cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
-            if not math.isfinite(values["gradient_norm"]):
-                cause = "its gradient is not finite"
-            note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}"
-            return UpdateReport({**values, **levels}, note, cause, alarms)
-
-        return run.train(learner, make_update, title="fine-tune", card=card)
-
-    return train_in_processes(train, config, len(scenarios), out)
+        cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
+        if not math.isfinite(values["gradient_norm"]):
+            cause = "its gradient is not finite"
+        note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}"
+        return UpdateReport({**values, **levels}, note, cause, alarms)
 
 
 def prepare(
@@ -114,10 +85,10 @@ def prepare(
     """Freeze the weights that are not trained, copy the reference, make the optimizer. Dropout is off from here on.
 
     Args:
-        policy: changed in place.
-        config: see its fields.
-        device: to train on.
-        augmented: goals beside the logged endpoints.
+        policy: Policy to train in place.
+        config: Settings of the run; a stored run resumes only with equal ones.
+        device: Device to train on; the policy moves there.
+        augmented: Stored goals beside the logged endpoints; None = endpoints alone.
     """
     # With dropout the scored distribution would not be the one that was sampled from.
     policy.to(device).eval()
@@ -130,7 +101,13 @@ def prepare(
     )
     reference = copy.deepcopy(policy).requires_grad_(False)
     beta = config.kl.initial_beta
-    return RewardLearner(policy=policy, reference=reference, optimizer=optimizer, beta=beta, augmented_goals=augmented)
+    return RewardLearner(
+        policy=policy, reference=reference, optimizer=optimizer, config=config, beta=beta, augmented_goals=augmented,
+        inputs={"augmented_goals": augmented.fingerprint} if augmented else {},
+        may_grow=("epochs",),  # the learning rate is constant: a longer run passes through the same weights
+        skip_rule=f"KL above max_kl={config.max_kl} or not finite",
+        remedy="lower learning_rate or raise kl.initial_beta",
+    )  # fmt: skip
 
 
 def update_policy(
@@ -139,27 +116,28 @@ def update_policy(
     """Make one update of the policy, as in RLFTSim, section 4.1.
 
     Args:
-        learner: changed in place.
+        learner: Policy, reference and counters, changed in place.
         batch: this process's scenarios of the update, with their futures.
-        config: see its fields.
-        fabric: processes and precision.
+        config: Settings of the run; a stored run resumes only with equal ones.
+        fabric: Processes of the run, and the precision of its passes.
 
     Returns:
         Metrics by the names of metrics.jsonl.
     """
     clock = UpdateClock(fabric.device)
     experiences: list[Experience] = []
-    own = local_rollouts(config.batch_size, config.num_rollouts, fabric)
-    for part in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
+    rollout_ids = local_rollouts(config.batch_size, config.num_rollouts, fabric)
+    for micro_batch in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
         context, rollouts = sample_rollouts(
-            learner.policy, part, config.goals, learner.augmented_goals,
-            num_rollouts=config.num_rollouts, own=own, seed=config.seed, update=learner.update, fabric=fabric,
+            learner.policy, micro_batch, config.goals, learner.augmented_goals,
+            num_rollouts=config.num_rollouts, rollout_ids=rollout_ids,
+            seed=config.seed, update=learner.update, fabric=fabric,
         )  # fmt: skip
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
-        realism, rewards = compute_reward(part, rollouts, config)
-        experiences.append(Experience(part, rollouts, realism, rewards, context, own))
+        realism, rewards = compute_reward(micro_batch, rollouts, config)
+        experiences.append(Experience(micro_batch, rollouts, realism, rewards, context, rollout_ids))
         clock.lap("reward")
     speed = {}
     if config.hold_speed:  # over the whole batch, so not by part

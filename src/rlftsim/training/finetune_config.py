@@ -9,7 +9,7 @@ from rlftsim.realism import metric_by_name
 from rlftsim.rewards import CreditTo, parse_reward, write_reward
 from rlftsim.rewards.goal import goal_terms
 from rlftsim.training.alarms import AlarmConfig
-from rlftsim.training.freezing import TrainedParts
+from rlftsim.training.freezing import TrainedModules
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.reference import KlConfig
@@ -61,7 +61,7 @@ class FinetuneConfig:
     itself. Not with goals, which ask for a speed. False = the paper's objective."""
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
-    trained: TrainedParts = "decoder"
+    trained: TrainedModules = "decoder"
     """The parts a policy names for fine-tuning, its last layers, its goal encoder, or everything."""
     kl: KlConfig = field(default_factory=KlConfig)
     max_kl: float = 5.0

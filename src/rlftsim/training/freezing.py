@@ -13,14 +13,14 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.training.goals import not_conditioned
 
-TrainedParts = Literal["decoder", "head", "goals", "all"]
+TrainedModules = Literal["decoder", "head", "goals", "all"]
 
 
-def trained_parts(policy: nn.Module, trained: TrainedParts) -> tuple[nn.Module, ...]:
+def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[nn.Module, ...]:
     """The parts of a policy that are trained.
 
     Args:
-        policy: any.
+        policy: Policy that may name its modules for fine-tuning.
         trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, all of it where it names none.
             "head" = what it names in `head_modules`, its last layers. "goals" = the goal encoder only, so that agents
             without a goal go on deciding as before. "all" = everything.
@@ -29,47 +29,47 @@ def trained_parts(policy: nn.Module, trained: TrainedParts) -> tuple[nn.Module, 
         ConfigError: the policy is not goal-conditioned, has no part that only goals use, or names no head.
     """
     if trained == "goals":
-        parts = _goal_modules(policy)
-        if not parts and is_goal_conditioned(policy):
+        modules = _goal_modules(policy)
+        if not modules and is_goal_conditioned(policy):
             raise ConfigError(
                 f"trained=goals, but {type(policy).__name__} has no part that only goals use: set trained=all."
             )
-        if not parts:
+        if not modules:
             raise ConfigError(f"trained=goals, but {not_conditioned(policy)}")
     elif trained == "head":
         if not isinstance(policy, PolicyWithHead):
             raise ConfigError(f"trained=head, but {type(policy).__name__} names no head_modules: set trained=decoder.")
-        parts = policy.head_modules()
+        modules = policy.head_modules()
     else:
         named = getattr(policy, "fine_tuned_modules", None)
-        parts = (policy,) if trained == "all" or named is None else named()
-    return parts
+        modules = (policy,) if trained == "all" or named is None else named()
+    return modules
 
 
-def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
+def freeze_untrained(policy: nn.Module, trained: TrainedModules) -> None:
     """Require a gradient of the weights that are trained, and of no others.
 
     Args:
-        policy: changed in place.
-        trained: see `trained_parts`.
+        policy: Policy whose weights are frozen or released in place.
+        trained: see `select_trained_modules`.
 
     Raises:
-        ConfigError: of `trained_parts`.
+        ConfigError: of `select_trained_modules`.
     """
-    parts = trained_parts(policy, trained)
+    modules = select_trained_modules(policy, trained)
     # First nothing, then the parts: a run that trained other parts before leaves no trace.
     policy.requires_grad_(False)
-    for part in parts:
-        part.requires_grad_(True)
+    for module in modules:
+        module.requires_grad_(True)
 
 
-def refuse_constant_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedParts) -> None:
+def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules) -> None:
     """Refuse an entropy bonus for a policy whose entropy no trained weight moves, such as one with fixed noise.
 
     Args:
-        policy: left as it is.
-        scenario: to decide in once.
-        trained: see `trained_parts`.
+        policy: Policy to try, of which a copy decides.
+        scenario: Scenario in which the policy decides once.
+        trained: see `select_trained_modules`.
 
     Raises:
         ConfigError: the entropy of its decisions has no gradient.
@@ -90,14 +90,14 @@ def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]
     """The weights that require a gradient, as groups for an optimizer: the goal encoder apart from all others.
 
     Args:
-        model: after `freeze_untrained`.
+        model: Model whose untrained weights `freeze_untrained` has frozen.
         goal_scale: learning rate of the goal encoder over that of the others.
     """
-    goal_weights = [p for part in _goal_modules(model) for p in part.parameters() if p.requires_grad]
+    goal_weights = [p for module in _goal_modules(model) for p in module.parameters() if p.requires_grad]
     # By identity: comparing tensors would compare their values.
     ids = {id(p) for p in goal_weights}
-    others = [p for p in model.parameters() if p.requires_grad and id(p) not in ids]
-    groups = [{"params": others, "scale": 1.0}, {"params": goal_weights, "scale": goal_scale}]
+    base_weights = [p for p in model.parameters() if p.requires_grad and id(p) not in ids]
+    groups = [{"params": base_weights, "scale": 1.0}, {"params": goal_weights, "scale": goal_scale}]
     # AdamW refuses a group without parameters.
     return [group for group in groups if group["params"]]
 

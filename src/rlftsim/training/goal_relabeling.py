@@ -9,9 +9,8 @@ Source: after Ghosh et al., "Learning to Reach Goals via Iterated Supervised Lea
 rollouts are goal-free ones.
 """
 
-import os
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -20,16 +19,18 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, check_positive
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.rollout.policy import Policy, is_goal_conditioned
+from rlftsim.rollout.policy import is_goal_conditioned
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.vocabulary import class_of_type
-from rlftsim.training.closed_loop import TargetedRollouts, predict_along
+from rlftsim.training.closed_loop import TargetedRollouts, predict_targets
 from rlftsim.training.freezing import freeze_untrained
 from rlftsim.training.goals import not_conditioned
-from rlftsim.training.imitation import ImitationConfig, Prediction, imitate
-from rlftsim.training.run import TrainingScenarios, as_scenarios, require_trainable
+from rlftsim.training.imitation import ImitationConfig, ImitationMethod, Imitator, Prediction
+from rlftsim.training.method import check_trainable
+from rlftsim.training.parallel import Fabric
 
 NOT_VALIDATED = "goal-free behavior does not change here. See what was learned by `rlftsim evaluate --goals logged`."
 
@@ -59,36 +60,31 @@ class GcslConfig(ImitationConfig):
             )
 
 
-def gcsl_finetune(
-    policy: Policy, scenarios: TrainingScenarios, out: str | os.PathLike[str], config: GcslConfig, *, card: str = ""
-) -> Path:
-    """Train a policy's goal encoder in place; resumes where a run in `out` was stopped.
+class GcslMethod(ImitationMethod[GcslConfig]):
+    """Training of a policy's goal encoder ("gcsl")."""
 
-    Args:
-        policy: an nn.Module that implements `TokenPolicy` and is goal-conditioned.
-        scenarios: a data set, a list or one scenario, with their futures.
-        out: the run's folder.
-        config: see its fields.
-        card: README of the resulting model folder.
+    settings = GcslConfig
+    title = "goals"
+    validates = False
 
-    Returns:
-        The model folder, `out/model`.
+    def describe(self, settings: GcslConfig) -> str:
+        """Origin of the examples."""
+        return "own rollouts, relabelled"
 
-    Raises:
-        ConfigError: the policy has no weights or no tokens or no goal encoder, or there is no scenario.
-        CheckpointError: `out` holds another run, or the run diverged.
-        NotYetError: another run is at work in `out`.
-    """
-    scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "gcsl", needs=("vocabulary",))
-    if not is_goal_conditioned(model):
-        raise ConfigError(not_conditioned(model))
-    freeze_untrained(model, "goals")
+    def start(self, policy: Any, scenarios: Scenarios, settings: GcslConfig, fabric: Fabric) -> Imitator:
+        """Learner of the goal encoder of a `TokenPolicy`."""
+        check_trainable(policy, scenarios, "gcsl", needs=("vocabulary",))
+        if not is_goal_conditioned(policy):
+            raise ConfigError(not_conditioned(policy))
+        freeze_untrained(policy, "goals")
+        return super().start(policy, scenarios, settings, fabric)
 
-    def predict_along_own_rollouts(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
+    def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
+        """Predictions along the policy's rollouts, whose endpoints are the goals."""
+        model, config = learner.policy, learner.config
         model.eval()  # nothing that dropout would act on is trained
         context = model.encode(batch)
-        seed = derive_seed(config.seed, "rollouts", update)
+        seed = derive_seed(config.seed, "rollouts", learner.update)
         rollouts = simulate(model, batch, num_rollouts=config.num_rollouts, seed=seed, context=context, may_be_nan=True)
         # Autocast keeps weights that it has cast, and those cast in the rollout have no gradient.
         torch.clear_autocast_cache()
@@ -96,9 +92,7 @@ def gcsl_finetune(
         class_id = class_of_type(batch.object_type)
         # The targets are the decisions themselves, which were sampled without goals.
         targeted = TargetedRollouts(relabelled, rollouts.decision, rollouts.decision_mask, class_id)
-        return predict_along(model, context, targeted, trained)
-
-    return imitate(model, scenarios, out, config, predict_along_own_rollouts, title="goals", card=card)
+        return predict_targets(model, context, targeted, trained)
 
 
 def relabel_with_endpoints(rollouts: Rollouts) -> Rollouts:

@@ -72,12 +72,12 @@ def with_goals(config: GoalConfig) -> GoalConfig:
     return replace(config, probability=config.probability or 1.0, hindsight=config.hindsight or 1.0)
 
 
-def refuse_goals(policy: Policy, probability: float) -> None:
+def check_goals(policy: Policy, probability: float) -> None:
     """Refuse to train a policy with goals if it is not goal-conditioned.
 
     Args:
-        policy: to be trained.
-        probability: of an agent to have a goal; 0 = goal-free training, which any policy can do.
+        policy: Policy that a run is going to train.
+        probability: Probability of an agent to have a goal; 0 = goal-free training, which any policy can do.
 
     Raises:
         ConfigError: the policy is not goal-conditioned.
@@ -97,10 +97,10 @@ def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoal
     """Goals of a batch in one update, with N = 1: all rollouts of a scenario have the same.
 
     Args:
-        batch: with futures.
-        config: probabilities.
-        augmented: goals beside the logged endpoints.
-        seed: of the update; a scenario's goals depend on it and on the scenario, not on the rest of the batch.
+        batch: Scenarios with their logged futures.
+        config: Probabilities of goals and of augmented goals.
+        augmented: Stored goals beside the logged endpoints; None = endpoints alone.
+        seed: Seed of the update; the goals of a scenario do not depend on the rest of the batch.
 
     Returns:
         None where the fine-tuning is goal-free.
@@ -110,9 +110,9 @@ def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoal
     u = draw_noise(batch, range(1), seed=seed, purpose="goals", per_agent=2)  # [B, 1, A, 2], uniform
     goals = logged_goals(batch)
     if augmented is not None:
-        others = augmented.of_batch(batch)
+        augmented_goals = augmented.of_batch(batch)
         # One draw for a whole scenario, that of its first agent: endpoints of the log and of a rollout do not mix.
-        use_others = others.goal_mask.any(-1, keepdim=True) & (u[:, :, :1, 1] < config.augmented_probability)
-        goals = others.where(use_others.expand_as(goals.goal_mask), goals)
+        is_augmented = augmented_goals.goal_mask.any(-1, keepdim=True) & (u[:, :, :1, 1] < config.augmented_probability)
+        goals = augmented_goals.where(is_augmented.expand_as(goals.goal_mask), goals)
     # Noise in [0, 1): with probability 1 every agent that has a logged endpoint gets it as its goal.
     return goals.only(u[..., 0] < config.probability)

@@ -40,8 +40,8 @@ def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Te
     its own part, because each agent's decisions have an importance ratio of their own.
 
     Args:
-        experiences: of this process.
-        terms: of the run's reward.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        terms: Terms of the run's reward, of which those with goals count.
     """
     relabelled = []
     for experience in experiences:
@@ -60,8 +60,8 @@ def met_goals(rollouts: Rollouts, realism: RealismResult) -> Goals:
     """Endpoints of the most realistic rollout of each scenario, for the agents that have goals.
 
     Args:
-        rollouts: with goals, N of each scenario.
-        realism: of the same rollouts.
+        rollouts: Rollouts with goals, N of each scenario.
+        realism: Scores of the same rollouts, a row per scenario.
     """
     assert rollouts.goals is not None
     # All rollouts of a scenario have the same goals: the mask of the first one serves.
@@ -73,8 +73,8 @@ def importance_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -
     """Probability of each agent's decisions under new goals over that under old ones; clipped, without gradient.
 
     Args:
-        new: log-probability of all of an agent's decisions under the new goals.
-        old: under the goals they were sampled under.
+        new: Log-probability of all of an agent's decisions under the new goals, nats.
+        old: Log-probability under the goals at sampling, nats.
     """
     # Clipped from above only: a large ratio raises the variance, a small one merely drops an agent.
     return (new - old).detach().clamp(max=math.log(LARGEST_RATIO)).exp()
@@ -95,13 +95,13 @@ def accumulate_hindsight(
 
     Args:
         policy: scores the relabelled rollouts.
-        experiences: of this process.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
         reward: terms of the run's reward.
         first_pass: has the log-probabilities under the old goals.
         terms: reduction and counts of the update.
-        fabric: precision and processes.
-        weight: of this gradient; 0 = nothing is done.
-        rollouts_per_pass: as in `accumulate_gradients`.
+        fabric: Precision of the passes, and processes that sums are added over.
+        weight: Weight of this gradient; 0 = no second pass.
+        rollouts_per_pass: Rollouts of a scenario that are scored at once, as in `accumulate_gradients`.
 
     Returns:
         Metrics: the mean importance ratio. Empty in a run without hindsight.
@@ -111,16 +111,16 @@ def accumulate_hindsight(
     # The gradient is divided by the mean ratio of the whole batch, which is known in the end only: so it is gathered
     # apart from the gradient of the first pass, and added to it when it has its scale.
     parameters = [p for p in policy.parameters() if p.requires_grad]
-    before = [p.grad for p in parameters]
+    first_gradients = [p.grad for p in parameters]
     for parameter in parameters:
         parameter.grad = None
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # ratios, agents
     relabelled = relabel_with_hindsight(experiences, reward)
-    for part, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
-        for (rollouts, earned), old in zip(part.slices(rollouts_per_pass), old_log_probs):
+    for experience, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
+        for (rollouts, earned), old in zip(experience.slices(rollouts_per_pass), old_log_probs):
             mask, decides = rollouts.decision_mask, rollouts.decision_mask.any(-1)  # [B, n, A, L], [B, n, A]
             with fabric.autocast():
-                dist = policy.score(encode_like(policy, part.batch, part.context), rollouts)
+                dist = policy.score(encode_like(policy, experience.batch, experience.context), rollouts)
             log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
             ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
             by_agent = agent_log_prob(log_prob, mask, terms.config.log_prob_reduction)
@@ -129,7 +129,7 @@ def accumulate_hindsight(
             sums += torch.stack([ratio[decides].sum(), decides.sum()])
     total, count = all_reduce_sum(sums, fabric).tolist()
     mean = total / max(count, 1.0)
-    for parameter, gradient in zip(parameters, before):
+    for parameter, gradient in zip(parameters, first_gradients):
         if parameter.grad is not None:
             parameter.grad *= weight / max(mean, 1e-6)
         if gradient is not None:

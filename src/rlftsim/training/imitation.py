@@ -7,13 +7,11 @@ brings (`ImitatedPolicy`); its sum over everything that an update sees is divide
 
 import copy
 import math
-import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool
@@ -27,20 +25,18 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
 from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary
-from rlftsim.training.batches import micro_batches
-from rlftsim.training.data import batch_with_futures, mirrored_of_update, trained_agents
+from rlftsim.training.data import trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, num_sharing_memory
-from rlftsim.training.run import Learner, TrainingRun, UpdateReport, train_in_processes
-from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
+from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum
+from rlftsim.training.validation import ValidationConfig
 
 IMPOSSIBLE = -1e8
 """A token that cannot be chosen has a smaller logit than this."""
 
 
-Predict = Callable[[ScenarioBatch, Bool[Tensor, "B A"], int], Prediction | ImitationLoss]
-"""Predictions of tokens, or a finished loss, both differentiable: for a batch, the agents that count and the number of
-the update (counted from 0)."""
+Predict = Callable[[ScenarioBatch, Bool[Tensor, "B A"]], Prediction | ImitationLoss]
+"""Predictions of tokens, or a finished loss, both differentiable: for a batch and the agents that count."""
 
 
 @dataclass(frozen=True)
@@ -129,27 +125,29 @@ class ImitationConfig:
 
 
 @dataclass(eq=False, kw_only=True)
-class _Imitator(Learner):
+class Imitator(Learner):
     """A model in training, with what its updates are made of."""
 
-    run: TrainingRun
-    predict: Predict
-    config: ImitationConfig
-    fabric: Fabric
+    num_scenarios: int
+    """Training scenarios, all of them."""
     average: nn.Module | None = None
     """Moving average of the weights, as a policy of its own."""
-    kept: Mapping[str, nn.Module] = field(default_factory=dict)
-    """Further modules of the method that change during the run."""
+    frozen: Any = None
+    """Policy that rolls out in place of the model, where the method has such a policy."""
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        return {**super().modules, **({} if self.average is None else {"average": self.average}), **self.kept}
+        """Model, average and frozen policy, as far as they exist."""
+        further = {"average": self.average, "frozen": self.frozen}
+        return {**super().modules, **{name: module for name, module in further.items() if module is not None}}
 
     @property
     def result(self) -> Any:
+        """The average, if there is one."""
         return self.policy if self.average is None else self.average
 
     def finish_update(self, *, is_good: bool) -> None:
+        """Take the optimizer's step, and move the average towards the weights."""
         super().finish_update(is_good=is_good)
         if self.average is None or self.config.ema_decay is None or not is_good:
             return
@@ -163,108 +161,89 @@ class _Imitator(Learner):
                     mean.copy_(weight)
 
 
-def imitate(
-    model: Any,
-    scenarios: Scenarios,
-    out: str | os.PathLike[str],
-    config: ImitationConfig,
-    predict: Predict,
-    *,
-    title: str,
-    held_out: Scenarios | None = None,
-    kept: Mapping[str, nn.Module] | None = None,
-    card: str = "",
-) -> Path:
-    """Train the parameters of a model that require a gradient; resumes where a run in `out` was stopped.
-
-    Args:
-        model: an nn.Module, checked by `require_trainable`.
-        scenarios: with their futures; scenarios without are refused.
-        out: the run's folder.
-        config: see its fields.
-        predict: the model's predictions, or their loss.
-        title: label of the progress bar.
-        held_out: scenarios to validate on; None = no validation.
-        kept: further modules that `predict` changes, by name, for the run's checkpoints.
-        card: README of the resulting model folder.
-
-    Returns:
-        The model folder, `out/model`.
-
-    Raises:
-        ConfigError: the model cannot be validated, or has no vocabulary, which spatial label smoothing and a weight of
-            standing tokens need.
-        CheckpointError: `out` holds another run, or the run diverged.
-        NotYetError: another run is at work in `out`.
-    """
-    if not isinstance(getattr(model, "vocabulary", None), Vocabulary):
-        name = type(model).__name__
-        if config.label_smoothing_kind == "spatial":
-            raise ConfigError(
-                f"{name} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
-            )
-        if config.still_weight != 1.0:
-            raise ConfigError(f"{name} has no vocabulary, so no token is known to stand still: set still_weight=1.")
-    if held_out is not None and config.validation.every:
-        refuse_to_validate(model, held_out, config.validation)
-    train = partial(
-        _imitate, model, scenarios, out, predict, title=title, held_out=held_out, kept=kept or {}, card=card
-    )
-    return train_in_processes(train, config, len(scenarios), out)
+Config = TypeVar("Config", bound=ImitationConfig)
 
 
-def _imitate(
-    model: Any,
-    scenarios: Scenarios,
-    out: str | os.PathLike[str],
-    predict: Predict,
-    config: ImitationConfig,
-    fabric: Fabric,
-    *,
-    title: str,
-    held_out: Scenarios | None,
-    kept: Mapping[str, nn.Module],
-    card: str,
-) -> Path:
-    """Training in one of the processes of a run."""
-    run = TrainingRun(model, scenarios, out, config, fabric)
-    # Dropout is on: unlike fine-tuning with rewards, imitation has no sampled log-probabilities to reproduce.
-    model.to(fabric.device).train()
-    groups = parameter_groups(model, config.goal_learning_rate_scale)
-    learner = _Imitator(
-        policy=model,
-        optimizer=torch.optim.AdamW(
-            groups, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
-        ),
-        run=run,
-        predict=predict,
-        config=config,
-        fabric=fabric,
-        average=None if config.ema_decay is None else copy.deepcopy(model).requires_grad_(False),
-        kept=kept,
-    )
-    validated = ""
+class ImitationMethod(Method[Config]):
+    """Base of methods that learn by imitation: a method brings `predict`, and its checks in `start`."""
 
-    def make_update() -> UpdateReport:
-        nonlocal validated
+    validates = True
+
+    def start(self, policy: Any, scenarios: Scenarios, settings: Config, fabric: Fabric) -> Imitator:
+        """Learner of the policy's parameters that require a gradient.
+
+        Raises:
+            ConfigError: The policy has no vocabulary, which spatial label smoothing and a weight of standing tokens
+                need.
+        """
+        if not isinstance(getattr(policy, "vocabulary", None), Vocabulary):
+            name = type(policy).__name__
+            if settings.label_smoothing_kind == "spatial":
+                raise ConfigError(
+                    f"{name} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
+                )
+            if settings.still_weight != 1.0:
+                raise ConfigError(f"{name} has no vocabulary, so no token is known to stand still: set still_weight=1.")
+        # Dropout is on: unlike fine-tuning with rewards, imitation has no sampled log-probabilities to reproduce.
+        policy.to(fabric.device).train()
+        groups = parameter_groups(policy, settings.goal_learning_rate_scale)
+        optimizer = torch.optim.AdamW(
+            groups, lr=settings.learning_rate, betas=settings.betas, weight_decay=settings.weight_decay
+        )
+        average = None if settings.ema_decay is None else copy.deepcopy(policy).requires_grad_(False)
+        return Imitator(
+            policy=policy, optimizer=optimizer, config=settings, num_scenarios=len(scenarios), average=average
+        )
+
+    def predict(
+        self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]
+    ) -> Prediction | ImitationLoss:
+        """Predictions of tokens, or a finished loss, both differentiable.
+
+        Args:
+            learner: Model and settings; the update is `learner.update`.
+            batch: Scenarios with their futures.
+            trained: True = the agent's predictions count.
+        """
+        raise NotImplementedError
+
+    def update(self, learner: Imitator, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
+        """One optimizer step along the trajectories of the method."""
         start = time.perf_counter()
-        values = _update(learner, learner.update)
+        values = update_imitator(learner, scenarios, partial(self.predict, learner), fabric)
         values["seconds"] = time.perf_counter() - start
-        if held_out is not None and config.validation.is_due(learner.update, run.total):
-            values |= validate(learner.result, held_out, config.validation, fabric)
-            validated = f", RMM {values['validation_rmm']:.3f}"
         accuracy = f", accuracy {values['accuracy']:.0%}" if "accuracy" in values else ""
-        note = f"loss {values['loss']:.3f}{accuracy}{validated}"
-        return UpdateReport(values, note, "its gradient is not finite")
+        return UpdateReport(values, f"loss {values['loss']:.3f}{accuracy}", "its gradient is not finite")
 
-    return run.train(learner, make_update, title=title, card=card)
+
+@dataclass(frozen=True)
+class PretrainConfig(ImitationConfig):
+    """Pre-training. The defaults, which recipes change, are those of the published SMART-tiny on WOMD."""
+
+
+class PretrainMethod(ImitationMethod[PretrainConfig]):
+    """Pre-training: predict the next motion token along logged tracks, or minimize the policy's own loss."""
+
+    settings = PretrainConfig
+    title = "pre-train"
+
+    def start(self, policy: Any, scenarios: Scenarios, settings: PretrainConfig, fabric: Fabric) -> Imitator:
+        """Learner of a policy that is a PretrainablePolicy or an ImitatedPolicy."""
+        check_trainable(policy, scenarios, "pre-training", is_imitated=True)
+        return super().start(policy, scenarios, settings, fabric)
+
+    def predict(
+        self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]
+    ) -> Prediction | ImitationLoss:
+        """Predictions or loss along the log."""
+        return loss_along_log(learner.policy, batch, trained, learner.update)
 
 
 def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
     """Learning rate of an update: linear warm-up, then a cosine down to `final_lr_ratio` of the highest.
 
     Args:
-        update: counted from 0.
+        update: Number of the update, from 0.
         total: updates of the run.
         config: has the highest rate, the warm-up and the ratio.
     """
@@ -276,10 +255,20 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
     return config.learning_rate * (low + 0.5 * (1 - low) * (1 + math.cos(math.pi * progress)))
 
 
-def _update(learner: _Imitator, update: int) -> dict[str, float]:
-    """One optimizer step: sums of losses over micro batches and processes, divided by the number of predictions."""
-    config, fabric, run = learner.config, learner.fabric, learner.run
-    set_learning_rate(learner.optimizer, learning_rate(update, run.total, config))
+def update_imitator(
+    learner: Imitator, scenarios: UpdateScenarios, predict: Predict, fabric: Fabric
+) -> dict[str, float]:
+    """Metrics of one optimizer step: sums of losses over micro batches and processes, over the number of predictions.
+
+    Args:
+        learner: Model and settings, changed in place.
+        scenarios: Scenarios of the update that this process works on.
+        predict: Predictions of a batch for the agents that count, or their loss.
+        fabric: Precision of the passes, and processes that sums are added over.
+    """
+    config, update = learner.config, learner.update
+    num_updates = config.num_updates(learner.num_scenarios)
+    set_learning_rate(learner.optimizer, learning_rate(update, num_updates, config))
     # Dropout depends on the update and the process alone, so a resumed run draws the same.
     torch.manual_seed(derive_seed(config.seed, "dropout", update, fabric.global_rank) % 2**63)
     learner.optimizer.zero_grad(set_to_none=True)
@@ -287,18 +276,15 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     # 1. Gradients of the summed loss add up over micro batches.
     names: list[str] = []  # of further metrics; every micro batch has the same
     sums = torch.zeros((), device=fabric.device)  # becomes [2 + names]: loss, further metrics, number of predictions
-    own, sharing = run.local_indices(update), num_sharing_memory(fabric)
-    max_count = max(config.micro_batch_size // sharing, 1)
-    max_cost = None if config.micro_batch_cost is None else config.micro_batch_cost / sharing
-    mirror = mirrored_of_update(update, own, config.mirror_probability, config.seed)
-    for micro in micro_batches(own, run.costs, max_count=max_count, max_cost=max_cost):
-        batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m, mirror=mirror)
-        batch = batch.to(fabric.device)
+    for batch in scenarios.micro_batches(
+        config.micro_batch_size, config.micro_batch_cost,
+        context_radius_m=config.context_radius_m, mirror_probability=config.mirror_probability,
+    ):  # fmt: skip
         trained = trained_agents(
             batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed
         )
         with fabric.autocast():
-            predicted = learner.predict(batch, trained, update)
+            predicted = predict(batch, trained)
         # Outside of autocast, where a cross-entropy is in full precision.
         if not isinstance(predicted, ImitationLoss):
             predicted = summed_loss(predicted, config.label_smoothing, nearby, config.still_weight)
@@ -331,10 +317,10 @@ def loss_along_log(
     """The model's own imitation loss, or its predictions of the next token along logged tracks.
 
     Args:
-        model: a PretrainablePolicy or an ImitatedPolicy; its own loss goes first.
-        batch: with its future.
+        model: PretrainablePolicy or ImitatedPolicy, whose own loss goes first.
+        batch: Scenarios with their logged futures.
         trained: True = the agent's predictions count.
-        update: counted from 0; what an own loss draws depends on it.
+        update: Number of the update, from 0; draws of an own loss depend on it.
     """
     own_loss = getattr(model, "imitation_loss", None)
     return model.teacher_forced(batch, trained) if own_loss is None else own_loss(batch, trained, update)
@@ -349,12 +335,12 @@ def accumulate_imitation(
     is known only when all have been made, so what was accumulated is scaled at the end.
 
     Args:
-        model: with zero gradients; see `loss_along_log`.
+        model: Model with zero gradients, as `loss_along_log` takes it.
         batches: this process's scenarios, with their futures; all agents with a future count.
-        weight: of the loss.
+        weight: Weight of the loss in the objective.
         fabric: precision, and the processes that the mean is over.
-        update: counted from 0.
-        seed: of what an own loss draws, which depends on it, the update and the process alone.
+        update: Number of the update, from 0.
+        seed: Seed of the draws of an own loss; with update and process it determines them.
 
     Returns:
         The mean loss, nats per prediction for policies over tokens.

@@ -34,8 +34,8 @@ class MapUse:
         """Sums of no token."""
         return cls(torch.zeros(2, 3, dtype=torch.float64, device=device))
 
-    def __add__(self, other: "MapUse") -> "MapUse":
-        return MapUse(self.sums + other.sums)
+    def __add__(self, addend: "MapUse") -> "MapUse":
+        return MapUse(self.sums + addend.sums)
 
     def to_metrics(self, prefix: str = "") -> dict[str, float]:
         """Mean loss and map use (loss without minus with the map), nats per token, of all and of turning tokens.
@@ -48,9 +48,9 @@ class MapUse:
         count, with_map, without = self.sums.T  # [2] each
         values = {"loss": with_map / count, "map_use": (without - with_map) / count}
         return {
-            f"{prefix}{name}{kind}": float(value[row])
+            f"{prefix}{name}{suffix}": float(value[row])
             for name, value in values.items()
-            for row, kind in enumerate(("", "_turning"))
+            for row, suffix in enumerate(("", "_turning"))
         }
 
 
@@ -64,15 +64,15 @@ def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
     """Cross-entropy of the logged vehicles' tokens, with the map and with the map 5 km away.
 
     Args:
-        policy: with a vocabulary, in evaluation mode.
-        batch: with its future, on the policy's device.
+        policy: Policy with a vocabulary, in evaluation mode.
+        batch: Scenarios with their futures, on the policy's device.
     """
-    away = []
+    shifted = []
     for scenario in batch.scenarios:
         points = scenario.map_features.points + AWAY_M
-        away.append(replace(scenario, map_features=replace(scenario.map_features, points=points)))
+        shifted.append(replace(scenario, map_features=replace(scenario.map_features, points=points)))
     losses, turning = _vehicle_losses(policy, batch)
-    without, _ = _vehicle_losses(policy, collate(away).to(batch.device))
+    without, _ = _vehicle_losses(policy, collate(shifted).to(batch.device))
     columns = torch.stack([torch.ones_like(losses), losses, without], -1).double()  # [r, 3]
     return MapUse(torch.stack([columns.sum(0), columns[turning].sum(0)]))
 

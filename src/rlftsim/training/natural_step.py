@@ -20,7 +20,7 @@ def natural_direction(
     """Direction of the largest gain per KL, of those in which the predicted change of the fixed means is 0.
 
     Args:
-        gradient: Of the objective by the weights.
+        gradient: Gradient [K] of the objective by the weights.
         fisher: Covariance of the score function, per decision. A weight without any stays 0.
         fixed: Gradients of means that are to stay as they are.
         kl: Predicted KL of the result, ½ e·F e, nats per decision.
@@ -33,11 +33,11 @@ def natural_direction(
     metric = fisher[np.ix_(is_used, is_used)]
     metric = metric + RIDGE * np.diag(np.diag(metric))
     free = np.linalg.solve(metric, gradient[is_used]) if is_used.any() else step[is_used]
-    held = fixed[:, is_used]
-    if held.any():
+    constrained = fixed[:, is_used]
+    if constrained.any():
         # in the metric of the KL, so that the step changes as little as it has to
-        across = np.linalg.solve(metric, held.T)  # [K, C]
-        free = free - across @ np.linalg.lstsq(held @ across, held @ free, rcond=1e-10)[0]
+        across = np.linalg.solve(metric, constrained.T)  # [K, C]
+        free = free - across @ np.linalg.lstsq(constrained @ across, constrained @ free, rcond=1e-10)[0]
     square = free @ metric @ free
     # what projection leaves of a gradient that lies along the constraints is rounding
     if square > 1e-20 * max(gradient @ gradient, 1e-300):

@@ -99,7 +99,7 @@ class DeviceConfig:
 
     @property
     def forks(self) -> bool:
-        """True if `processes.in_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
+        """True if `linked_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
         return not self.uses_cuda and self.num_nodes == 1 and not is_torchrun()
 
     def num_processes(
@@ -108,7 +108,7 @@ class DeviceConfig:
         """Processes of a run on this machine; the number that "auto" stands for.
 
         Args:
-            num_scenarios: in the data set.
+            num_scenarios: Number of scenarios in the data set; few are trained on by one process.
             batch_size: scenarios of an update; each process needs one.
             micro_batch_size: scenarios in memory at once, which the processes on a CPU share.
             begun_with: number of a run that is resumed.
@@ -133,7 +133,7 @@ def can_fork() -> bool:
 
 
 def start_fabric(config: DeviceConfig) -> Fabric:
-    """Device and precision of a run, and its processes on GPUs or under torchrun; for a CPU's see `in_processes`.
+    """Device and precision of a run, and its processes on GPUs or under torchrun; for a CPU's see `linked_processes`.
 
     Raises:
         ConfigError: CUDA is requested, but there is none.
@@ -180,27 +180,27 @@ def local_indices(
     """This process's part of a global batch. Of fewer scenarios than processes, several processes have the same one.
 
     Args:
-        items: scenario indices of the global batch.
-        fabric: the processes.
-        costs: of each item; the parts then cost about the same, else they are equally large.
-        num_rollouts: of each item, see `local_rollouts`.
+        items: Indices of the scenarios of the global batch.
+        fabric: Processes of the run, over which sums are added.
+        costs: Cost of each item, so that shares cost about the same; None = shares are equally large.
+        num_rollouts: Rollouts of each item, which processes in excess divide, see `local_rollouts`.
 
     Raises:
         ConfigError: the processes cannot divide the scenarios, nor their rollouts, evenly.
     """
     sharing = _num_sharing_scenario(len(items), num_rollouts, fabric)
-    parts = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size // sharing)
+    groups = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size // sharing)
     # The first part has the most expensive scenario, and rank 0 has more to do than others: it adds, logs and writes.
-    return [items[place] for place in parts[-1 - fabric.global_rank // sharing]]
+    return [items[index] for index in groups[-1 - fabric.global_rank // sharing]]
 
 
 def local_rollouts(num_items: int, num_rollouts: int, fabric: Fabric) -> range:
     """Rollouts of its scenarios that this process simulates and scores: all, or a part where several share a scenario.
 
     Args:
-        num_items: scenarios of the global batch.
-        num_rollouts: of each.
-        fabric: the processes.
+        num_items: Number of scenarios in the global batch.
+        num_rollouts: Rollouts of each scenario.
+        fabric: Processes of the run, over which sums are added.
 
     Raises:
         ConfigError: as `local_indices`.
@@ -216,10 +216,10 @@ def _num_sharing_scenario(num_items: int, num_rollouts: int, fabric: Fabric) -> 
         return 1
     possible = [num_items * count for count in range(2, num_rollouts + 1) if num_rollouts % count == 0]
     if fabric.world_size not in possible:
-        more = f", or to {' or '.join(map(str, possible))}, which divide the rollouts of a scenario" if possible else ""
+        hint = f", or to {' or '.join(map(str, possible))}, which divide the rollouts of a scenario" if possible else ""
         raise ConfigError(
             f"a batch of {num_items} scenarios cannot be spread over {fabric.world_size} processes: raise batch_size, "
-            f"or set device.processes to {num_items} at most{more}."
+            f"or set device.processes to {num_items} at most{hint}."
         )
     return fabric.world_size // num_items
 
@@ -236,7 +236,7 @@ def all_reduce_sum(values: Tensor, fabric: Fabric) -> Tensor:
 
     Args:
         values: this process's summand; all processes have the same shape.
-        fabric: the processes.
+        fabric: Processes of the run, over which sums are added.
     """
     if fabric.world_size == 1:
         return values
@@ -247,18 +247,18 @@ def all_gather(tensors: Mapping[str, Tensor], fabric: Fabric) -> list[dict[str, 
     """The tensors of all processes, in the order of ranks, bit for bit and on this process's device.
 
     Args:
-        tensors: of this process; those of others may have other shapes.
-        fabric: the processes.
+        tensors: Tensors of this process by name; other processes may have other shapes.
+        fabric: Processes of the run, over which sums are added.
     """
     file = io.BytesIO()
     torch.save({name: tensor.contiguous() for name, tensor in tensors.items()}, file)
-    own = torch.frombuffer(file.getbuffer(), dtype=torch.uint8).to(fabric.device)
+    message = torch.frombuffer(file.getbuffer(), dtype=torch.uint8).to(fabric.device)
     sizes = torch.zeros(fabric.world_size, dtype=torch.int64, device=fabric.device)
-    sizes[fabric.global_rank] = len(own)
+    sizes[fabric.global_rank] = len(message)
     sizes = all_reduce_sum(sizes, fabric)
     # A sum is all that every kind of `Fabric` has: each process has a row of its own, and the others add zeros to it.
     rows = torch.zeros(fabric.world_size, int(sizes.max()), dtype=torch.uint8, device=fabric.device)
-    rows[fabric.global_rank, : len(own)] = own
+    rows[fabric.global_rank, : len(message)] = message
     rows = all_reduce_sum(rows, fabric).cpu().numpy()
     files = (io.BytesIO(row[:size].tobytes()) for row, size in zip(rows, sizes.tolist()))
     return [torch.load(file, map_location=fabric.device, weights_only=True) for file in files]
@@ -268,8 +268,8 @@ def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> 
     """Sum every gradient over all processes, in place, as one message.
 
     Args:
-        parameters: in the same order in every process; one that has no gradient here adds zero.
-        fabric: the processes.
+        parameters: Parameters in the same order in every process; without a gradient here a parameter adds zero.
+        fabric: Processes of the run, over which sums are added.
     """
     parameters = list(parameters)
     if fabric.world_size == 1:
@@ -284,5 +284,5 @@ def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> 
     if not gradients:
         return
     total = all_reduce_sum(torch.cat([g.flatten() for g in gradients]), fabric)
-    for gradient, part in zip(gradients, total.split([g.numel() for g in gradients])):
-        gradient.copy_(part.view_as(gradient))
+    for gradient, flat in zip(gradients, total.split([g.numel() for g in gradients])):
+        gradient.copy_(flat.view_as(gradient))

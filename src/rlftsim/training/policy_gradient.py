@@ -28,7 +28,7 @@ def agent_log_prob(
     """Each agent's part of the log-probability of its rollout; summed over agents they are the rollout's.
 
     Args:
-        log_prob: of each decision, nats.
+        log_prob: Log-probability of each decision, nats.
         mask: True = the decision counts.
         reduction: "sum" over all decisions of the rollout, or their "mean": the sum over L decisions of each agent that
             decides at all.
@@ -46,8 +46,8 @@ def policy_gradient_loss(
     """Loss whose gradient is minus the policy gradient: - 1/B sum_b sum_i R[b, i] log pi(rollout i of b).
 
     Args:
-        reward: of each rollout, or of each agent in it, with its baseline inside; no gradient flows through it.
-        log_prob: of the same.
+        reward: Reward of each rollout, or of each agent in a rollout, minus its baseline; a constant of the gradient.
+        log_prob: Log-probability of the same rollouts or agents, nats.
         num_scenarios: B, over all slices and processes.
     """
     # By agent the reward of each multiplies its own part of the log-probability; by rollout all have the same.
@@ -114,8 +114,8 @@ def accumulate_gradients(
         reference: scores them without; under the same goals, unless the setting `kl.condition_reference` is False. A
             reference whose goal encoder was added for this run is still goal-free; an already conditioned one anchors
             the policy to its goal-following.
-        experiences: of this process.
-        terms: coefficients and counts.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        terms: Coefficients of the loss, and the global counts that sums are divided by.
         fabric: precision, and the processes that the statistics are summed over.
         rollouts_per_pass: rollouts of a scenario that are scored at once; changes memory, not the gradient.
     """
@@ -141,15 +141,15 @@ def accumulate_gradients(
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
                 context = encode_like(policy, experience.batch, experience.context)
                 dist, ref_dist = score_with_reference(policy, context, rollouts, reference, ref_context, ref_rollouts)
-            found = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
-            kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
-            by_agent = agent_log_prob(found.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
+            statistics = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
+            kl, entropy = masked_sum(statistics.kl, mask), masked_sum(statistics.entropy, mask)
+            by_agent = agent_log_prob(statistics.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
             loss = loss + (terms.beta * kl - terms.config.entropy_bonus * entropy) / num_decisions
             # Every slice adds its part; nothing is divided by the number of slices.
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])
-            log_prob = found.log_prob.detach()
+            log_prob = statistics.log_prob.detach()
             gaps.append(torch.where(mask, log_prob - rollouts.log_prob, 0.0).abs().max())
             by_experience[-1].append(agent_log_prob(log_prob, mask, "sum"))
     kl_sum, entropy_sum = all_reduce_sum(sums, fabric).tolist()

@@ -9,12 +9,12 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from multiprocessing.process import BaseProcess
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,26 +24,26 @@ from rlftsim.jobs.interruption import ctrl_c_blocked
 from rlftsim.jobs.processes import exit_with_parent, portable_error
 from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabric
 
-Result = TypeVar("Result")
 
+@contextmanager
+def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> Iterator[Fabric]:
+    """Start the processes of a run, and yield the fabric of this one, which has rank 0, for its share of the work.
 
-def in_processes(work: Callable[[Fabric], Result], config: DeviceConfig) -> Result:
-    """Call a function in each process of a run; returns its result in this one, which has rank 0.
-
-    On a CPU the other processes are forked here. They print nothing and write no files. They end with this call,
-    also with an error, Ctrl-C, or a kill of this process. An error of theirs is raised here.
+    On a CPU the other processes are forked here, and call the function. They print nothing and write no files. They end
+    with the `with`, also with an error, Ctrl-C, or a kill of this process. An error of theirs is raised here.
 
     Args:
-        work: called with the processes of the run, of which each sees itself as one.
-        config: has a number of processes, not "auto".
+        work: Function that the other processes call, each with the fabric that it sees itself in.
+        config: Device settings with a number of processes, not "auto".
 
     Raises:
-        ConfigError: several processes, but this one cannot be forked, or they should have several threads.
-        DataError: a process died.
+        ConfigError: Several processes, but this one cannot be forked, or they should have several threads.
+        DataError: A process died.
     """
     fabric, processes = start_fabric(config), config.processes
     if processes in ("auto", 1) or not config.forks:
-        return work(fabric)
+        yield fabric
+        return
     if not can_fork():
         raise ConfigError(
             f"device.processes={processes}: a CPU is shared among processes on Linux only, without a GPU, and outside "
@@ -56,25 +56,25 @@ def in_processes(work: Callable[[Fabric], Result], config: DeviceConfig) -> Resu
         )
     context = multiprocessing.get_context("fork")
     links: list[Connection] = []
-    helpers: list[BaseProcess] = []
+    workers: list[BaseProcess] = []
     try:
         with ctrl_c_blocked():
             for rank in range(1, processes):
-                link, theirs = Pipe()
+                link, remote_link = Pipe()
                 links.append(link)
-                process = LinkedProcess(fabric, rank, processes, [theirs])
-                helpers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
+                process = LinkedProcess(fabric, rank, processes, [remote_link])
+                workers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
                 with warnings.catch_warnings():
                     # Of forking beside threads, from Python 3.12 on. A helper uses none of the parent's.
                     warnings.simplefilter("ignore", DeprecationWarning)
-                    helpers[-1].start()
+                    workers[-1].start()
                 # Only the helper holds it from here on: its end is the end of the pipe.
-                theirs.close()
-        return work(LinkedProcess(fabric, 0, processes, links))
+                remote_link.close()
+        yield LinkedProcess(fabric, 0, processes, links)
     finally:
-        for helper in helpers:
-            helper.kill()  # they write no files, so none is left half-written
-            helper.join()
+        for worker in workers:
+            worker.kill()  # they write no files, so none is left half-written
+            worker.join()
 
 
 def _help(work: Callable[[Fabric], object], process: "LinkedProcess", inherited: Sequence[Connection]) -> None:

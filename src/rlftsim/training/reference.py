@@ -10,7 +10,7 @@ from torch import nn
 from rlftsim.errors import ConfigError, check_positive, check_types
 from rlftsim.training.alarms import Alarms
 from rlftsim.training.goals import StoredGoals
-from rlftsim.training.run import Learner
+from rlftsim.training.method import Learner
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,8 @@ class RewardLearner(Learner):
     augmented_goals: StoredGoals | None = None
     """Goals beside the logged endpoints."""
     alarms: Alarms = field(default_factory=Alarms)
+    warned_terms: set[str] = field(default_factory=set)
+    """Terms of the reward that a message has called not finite."""
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -74,7 +76,7 @@ def adapt_beta(beta: float, kl: float, config: KlConfig) -> float:
 
     Args:
         beta: strength during the update.
-        kl: of the update, nats per decision.
+        kl: KL of the update, nats per decision.
         config: target, horizon and bounds.
     """
     # Clipped, so that one wild update moves beta by at most 0.2 / horizon.
@@ -87,9 +89,9 @@ def sync_reference(reference: nn.Module, policy: nn.Module, alpha: float) -> Non
     """Move the reference's weights towards the policy's, in place: alpha * policy + (1 - alpha) * reference.
 
     Args:
-        reference: changed.
+        reference: Reference, moved in place towards the policy.
         policy: has the same parameters in the same order.
-        alpha: in [0, 1].
+        alpha: Weight of the policy, in [0, 1].
     """
     for old, new in zip(reference.parameters(), policy.parameters()):
         old.lerp_(new, alpha)

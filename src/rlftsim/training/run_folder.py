@@ -147,7 +147,7 @@ class RunFolder:
     """Opens a run's folder for the first time or to resume. Only the process of rank 0 writes.
 
     Args:
-        path: created if missing.
+        path: Folder of the run, created if missing.
         config: a dataclass of settings.
         inputs: hashes of what the run starts from, see `describe_inputs`.
         writes: False in all processes but that of rank 0.
@@ -218,11 +218,12 @@ class RunFolder:
         names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown - one_sided
         differing = sorted(name for name in names if old.get(name) != new.get(name))
         if differing:
-            most = 8  # settings named in one line
-            more = f" and {len(differing) - most} more" if len(differing) > most else ""
+            max_names = 8  # settings named in one line
+            remainder = f" and {len(differing) - max_names} more" if len(differing) > max_names else ""
+            names_text = f"{', '.join(differing[:max_names])}{remainder}"
             raise CheckpointError(
-                f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing[:most])}{more}): "
-                "name another --out, or remove the folder to start anew."
+                f"{self.path} belongs to a run with other settings or inputs ({names_text}): name another --out, or "
+                "remove the folder to start anew."
             )
         return old
 
@@ -244,8 +245,8 @@ class RunFolder:
 
         if self._metrics.exists():
             # a line cut short by a kill goes, too
-            kept = [line for line, values in _read_lines(self._metrics) if values["update"] <= update]
-            write_text(self._metrics, "".join(f"{line}\n" for line in kept))
+            lines = [line for line, values in _read_lines(self._metrics) if values["update"] <= update]
+            write_text(self._metrics, "".join(f"{line}\n" for line in lines))
         board = self.path / "tensorboard"
         with errors_name(board):
             self._board = SummaryWriter(str(board), purge_step=update + 1)
@@ -254,8 +255,8 @@ class RunFolder:
         """Add a line of metrics.
 
         Args:
-            update: updates done.
-            values: by name.
+            update: Number of updates done.
+            values: Metrics by name, numbers.
         """
         if not self._writes:
             return

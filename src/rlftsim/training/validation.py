@@ -64,8 +64,8 @@ class ValidationConfig:
         """True where a validation follows an update.
 
         Args:
-            update: updates done.
-            total: updates of the run.
+            update: Number of updates done.
+            total: Number of updates of the run.
         """
         return self.every > 0 and (update % self.every == 0 or update == total)
 
@@ -75,13 +75,13 @@ class ValidationConfig:
         return sorted(order[: self.num_scenarios].tolist())
 
 
-def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
+def check_validation(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
     """Refuse before a run what would end it at its first validation.
 
     Args:
-        model: in training.
-        scenarios: to validate on.
-        config: sampling.
+        model: Model in training, of which a copy simulates.
+        scenarios: Held-out scenarios, at least one.
+        config: Settings of the validation, of which sampling is tried.
 
     Raises:
         ConfigError: the model cannot simulate, or not with this sampling, or there is no scenario.
@@ -101,9 +101,9 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
 
     Args:
         model: a policy; left as it is, training mode included.
-        scenarios: to choose from, with their futures.
+        scenarios: Held-out scenarios to select from, with their futures.
         config: number and choice of scenarios and rollouts.
-        fabric: the processes.
+        fabric: Processes of the run, over which sums are added.
 
     Returns:
         Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
@@ -118,11 +118,11 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     # A copy, so that neither the mode nor a cache of the model in training changes.
     frozen: Any = copy.deepcopy(model).eval().requires_grad_(False)
     # Dealt out in turn: the same scenarios in total for any number of processes.
-    own = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
+    selected = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
     sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
     map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
-    for first in range(0, len(own), config.scenarios_per_pass):
-        batch = batch_with_futures(scenarios, own[first : first + config.scenarios_per_pass]).to(fabric.device)
+    for first in range(0, len(selected), config.scenarios_per_pass):
+        batch = batch_with_futures(scenarios, selected[first : first + config.scenarios_per_pass]).to(fabric.device)
         with fabric.autocast():
             rollouts = simulate(
                 frozen, batch, num_rollouts=config.num_rollouts, seed=config.seed, sampling=Sampling(top_k=config.top_k)

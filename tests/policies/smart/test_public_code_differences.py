@@ -19,8 +19,9 @@ from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.map_tokens import tokenize_map
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M
 from rlftsim.training.catk_rollouts import roll_out_closest
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.parallel import DeviceConfig
-from rlftsim.training.pretrain import PretrainConfig, pretrain
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 STILL = (0.0, (0.0, 0.0))
@@ -124,7 +125,7 @@ class Oracle(nn.Module):
 
 def first_update(model, folder):
     config = PretrainConfig(epochs=1.0, batch_size=1, device=DeviceConfig(accelerator="cpu", threads=1))
-    pretrain(model, [scenes.bend()], folder, config)
+    train_policy(model, [scenes.bend()], folder, config)
     return read_metrics(folder)[0]
 
 

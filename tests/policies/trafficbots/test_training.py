@@ -20,8 +20,7 @@ from rlftsim.policies.trafficbots.state import ImposedStates, start_traffic
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import TOTAL_STEPS
-from rlftsim.training.finetune import finetune
-from rlftsim.training.pretrain import pretrain
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig
 
@@ -50,7 +49,7 @@ def test_straight_drivers_are_learned_within_fifty_updates(tmp_path):
     movers = [scenes.Mover(x_m=12.0 * (i % 8), y_m=3.5 * (i // 8), speed_mps=4 + 0.4 * i) for i in range(24)]
     scene = scenes.build_scenario("straight", movers, scenes.straight_map())
     config = replace(PRETRAIN, batch_size=1, epochs=50.0, learning_rate=3e-3, checkpoint_every=100)
-    pretrain(new_policy(dropout=0.0, input_drop=0.0, prior_probability=0.0), [scene], tmp_path, config)
+    train_policy(new_policy(dropout=0.0, input_drop=0.0, prior_probability=0.0), [scene], tmp_path, config)
     lines = read_metrics(tmp_path)
     assert lines[-1]["imitation_loss"] < lines[0]["imitation_loss"] / 50
     assert lines[-1]["destination_loss"] < lines[0]["destination_loss"] / 5
@@ -60,12 +59,12 @@ def test_straight_drivers_are_learned_within_fifty_updates(tmp_path):
 def test_a_resumed_run_ends_with_the_same_weights(scenarios, tmp_path):
     whole, part, rest = new_policy(), new_policy(), new_policy()
     config = replace(PRETRAIN, epochs=4.0, checkpoint_every=2)
-    pretrain(whole, scenarios, tmp_path / "whole", config)
+    train_policy(whole, scenarios, tmp_path / "whole", config)
     folder = tmp_path / "part"
-    pretrain(part, scenarios, folder, config)
+    train_policy(part, scenarios, folder, config)
     for late in (folder / "checkpoints").glob("update-*4*"):
         late.rename(tmp_path / "gone")
-    pretrain(rest, scenarios, folder, config)
+    train_policy(rest, scenarios, folder, config)
     assert all(torch.equal(value, weights_of(rest)[name]) for name, value in weights_of(whole).items())
 
 
@@ -73,7 +72,7 @@ def test_the_gradient_does_not_depend_on_the_number_of_decisions_in_memory(scena
     norms = []
     for steps in (80, 9):
         config = replace(PRETRAIN, epochs=1.0)
-        pretrain(new_policy(steps_per_pass=steps, dropout=0.0), scenarios, tmp_path / str(steps), config)
+        train_policy(new_policy(steps_per_pass=steps, dropout=0.0), scenarios, tmp_path / str(steps), config)
         norms.append(read_metrics(tmp_path / str(steps))[0]["gradient_norm"])
     assert norms[0] == pytest.approx(norms[1], rel=1e-5)
 
@@ -82,7 +81,7 @@ def test_mixed_precision_gives_nearly_the_same_loss_and_gradient(scenarios, tmp_
     losses, norms = [], []
     for precision in ("32-true", "bf16-mixed"):
         config = replace(PRETRAIN, epochs=1.0, device=replace(tiny.CPU, precision=precision))
-        pretrain(new_policy(dropout=0.0), scenarios, tmp_path / precision, config)
+        train_policy(new_policy(dropout=0.0), scenarios, tmp_path / precision, config)
         first = read_metrics(tmp_path / precision)[0]
         losses.append(first["loss"])
         norms.append(first["gradient_norm"])
@@ -93,7 +92,7 @@ def test_mixed_precision_gives_nearly_the_same_loss_and_gradient(scenarios, tmp_
 def test_rewards_train_what_decides_and_nothing_that_draws(scenarios, tmp_path):
     policy = new_policy()
     before = weights_of(policy)
-    finetune(policy, scenarios, tmp_path, replace(tiny.FINETUNE, epochs=2.0, reward="mloo + 0.1*minade_rloo"))
+    train_policy(policy, scenarios, tmp_path, replace(tiny.FINETUNE, epochs=2.0, reward="mloo + 0.1*minade_rloo"))
     moved = {name.split(".")[1] for name, value in weights_of(policy).items() if not torch.equal(value, before[name])}
     assert moved == {"agents", "destination_map", "destination_pose", "add_destination", "add_personality", "actions"}
     lines = read_metrics(tmp_path)
@@ -106,7 +105,7 @@ def test_imitation_beside_rewards_draws_the_same_in_every_run(scenarios, tmp_pat
     for name in ("first", "second"):
         policy = new_policy()
         torch.manual_seed(len(name))  # what else draws does not matter
-        finetune(policy, scenarios, tmp_path / name, config)
+        train_policy(policy, scenarios, tmp_path / name, config)
         ends.append(weights_of(policy))
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
@@ -185,16 +184,18 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
 def test_goals_are_refused_in_words(scenarios, tmp_path):
     config = replace(tiny.FINETUNE, goals=replace(tiny.FINETUNE.goals, probability=1.0), reward="gcft")
     with pytest.raises(ConfigError, match="a TrafficBotsPolicy cannot be given goals"):
-        finetune(new_policy(), scenarios, tmp_path, config)
+        train_policy(new_policy(), scenarios, tmp_path, config)
 
 
 def test_settings_that_change_nothing_are_refused(scenarios, tmp_path):
     with pytest.raises(ConfigError, match="entropy_bonus has no effect"):
-        finetune(new_policy(), scenarios, tmp_path / "bonus", replace(tiny.FINETUNE, entropy_bonus=0.1))
+        train_policy(new_policy(), scenarios, tmp_path / "bonus", replace(tiny.FINETUNE, entropy_bonus=0.1))
     assert not (tmp_path / "bonus").exists()
     validation = ValidationConfig(every=100, num_scenarios=1, num_rollouts=2, top_k=3)
     with pytest.raises(ConfigError, match="top_k=3 needs a policy with categories"):
-        pretrain(new_policy(), scenarios, tmp_path / "k", replace(PRETRAIN, validation=validation), held_out=scenarios)
+        train_policy(
+            new_policy(), scenarios, tmp_path / "k", replace(PRETRAIN, validation=validation), held_out=scenarios
+        )
     assert not (tmp_path / "k" / "metrics.jsonl").exists()
 
 

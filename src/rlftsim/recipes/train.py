@@ -1,6 +1,6 @@
-"""Stages from a data set to trained policies: vocabulary, pre-training, fine-tuning by any method.
+"""The way from a data set to trained policies: vocabulary, pre-training, fine-tuning by any method.
 
-Each does what is missing in its folder, and refuses the folder of another run.
+Each stage does what is missing in its folder, and refuses the folder of another run.
 """
 
 import shutil
@@ -12,16 +12,18 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
-from rlftsim.recipes.calibration import prepare_policy
 from rlftsim.recipes.card import model_card
 from rlftsim.rollout.policy import ConditionablePolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.goals import not_conditioned
-from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
-from rlftsim.training.pretrain import PretrainConfig, pretrain
+from rlftsim.training.imitation import PretrainConfig
+from rlftsim.training.method import TrainingSettings, find_method
+from rlftsim.training.run import train_policy
 
 CACHED_SCENARIOS = 4096
 """About a megabyte each; their tokens are cached with them."""
@@ -51,8 +53,8 @@ def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path,
     """The vocabulary in a file; built from the training scenarios where the file is missing or of another origin.
 
     Args:
-        training: scenarios to build it from.
-        config: settings of the clustering.
+        training: Training scenarios, whose motions are clustered.
+        config: Settings of the clustering, such as the number of tokens.
         path: file to read, or to write.
         origin: text that says what it was built from; stored with it.
     """
@@ -75,8 +77,8 @@ def pretrain_policy(
 
     Args:
         policy: such as `recipe.new_policy(vocabulary)`; trained in place.
-        training: training scenarios.
-        config: settings.
+        training: Training scenarios of one data set, with their futures.
+        config: Settings of pre-training; a stored run resumes only with equal ones.
         out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
         start: name of the model whose weights the policy has, for the card; None = they are fresh.
         held_out: scenarios for validation, see `config.validation`.
@@ -84,17 +86,17 @@ def pretrain_policy(
     Raises:
         CheckpointError: `out` holds a run with other settings.
     """
-    what = "pre-trained" if start is None else f"pre-trained further from {start}"
-    card = model_card(what, training.folder, len(training), start)
+    description = "pre-trained" if start is None else f"pre-trained further from {start}"
+    card = model_card(description, training.folder, len(training), start)
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)  # weights of a loaded policy are frozen
-    return pretrain(policy, training, out, config, held_out=held_out, card=card)
+    return train_policy(policy, training, out, config, held_out=held_out, card=card)
 
 
 def finetune_model(
     base: str | Path,
     training: ScenarioDataset,
-    config: FinetuningConfig,
+    config: TrainingSettings,
     out: Path,
     *,
     conditioning: GoalConditioning | None = None,
@@ -104,7 +106,7 @@ def finetune_model(
 
     Args:
         base: model folder, or the folder of a run.
-        training: training scenarios.
+        training: Training scenarios of one data set, with their futures.
         config: settings: `FinetuneConfig` for a reward, `CatkConfig` for CAT-K, `GcslConfig` for imitation of the
             model's own rollouts, relabelled with their endpoints as goals.
         out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated; with a reward
@@ -123,10 +125,33 @@ def finetune_model(
         torch.manual_seed(config.seed)  # of the weights that encode goals; the base model brings the others
         policy = policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
 
-    what = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
-    card = model_card(what, training.folder, len(training), base)
+    description = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
+    card = model_card(description, training.folder, len(training), base)
     policy = prepare_policy(policy, config)
-    return finetune_policy(policy, training, out, config, held_out=held_out, card=card)
+    return train_policy(policy, training, out, config, held_out=held_out, card=card)
+
+
+def describe_method(config: object) -> str:
+    """The method of a fine-tuning in a few words, for the README of its model: by the type of its settings."""
+    method = find_method(config)
+    return "" if method is None else method.describe(config)
+
+
+def prepare_policy(policy: Any, config: object) -> Any:
+    """Policy with the features of a calibration, their weights 0; the policy itself for other methods.
+
+    Args:
+        policy: Base model. One that has been calibrated with the same features goes on from its weights.
+        config: Settings of the method.
+
+    Raises:
+        ConfigError: The policy has no vocabulary or no weights, or a feature is unknown.
+    """
+    if not isinstance(config, CalibrateConfig):
+        return policy
+    if isinstance(policy, CalibratedPolicy) and policy.features == config.features:
+        return policy
+    return CalibratedPolicy(policy, config.features)
 
 
 def start_from_shorter_run(out: Path, epochs: float) -> None:
@@ -139,18 +164,18 @@ def start_from_shorter_run(out: Path, epochs: float) -> None:
         epochs: length of the run to begin.
     """
 
-    def epochs_of(path: Path) -> float:
+    def parse_epochs(path: Path) -> float:
         return float(path.name.removesuffix("-epochs"))
 
     finished = [path for path in out.parent.glob("*-epochs") if (path / "model").exists()]
-    shorter = [path for path in finished if epochs_of(path) < epochs]
+    shorter = [path for path in finished if parse_epochs(path) < epochs]
     if out.exists() or not shorter:
         return
     # Copied under another name first: a copy that is interrupted must not look like a run.
-    found, copied = max(shorter, key=epochs_of), out.with_name(f".partial-{out.name}")
-    shutil.rmtree(copied, ignore_errors=True)
-    shutil.copytree(found / "checkpoints", copied / "checkpoints")
+    longest, copy = max(shorter, key=parse_epochs), out.with_name(f".partial-{out.name}")
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(longest / "checkpoints", copy / "checkpoints")
     # with its settings, so that one of other settings is refused rather than continued
     for name in ("config.json", "metrics.jsonl"):
-        shutil.copy(found / name, copied / name)
-    copied.rename(out)
+        shutil.copy(longest / name, copy / name)
+    copy.rename(out)
