@@ -99,7 +99,7 @@ class StoredModel:
 
 
 def _check_names(settings: Mapping[str, Any], names: set[str]) -> None:
-    """Check that the settings are those of a dataclass: a default for a missing value would make another model."""
+    """Check that the settings are those of a dataclass: a default for a missing value would make a different model."""
     missing, extra = (", ".join(sorted(s)) or "none" for s in (names - settings.keys(), settings.keys() - names))
     if settings.keys() != names:
         raise ConfigError(
@@ -120,7 +120,7 @@ def save_model(
 
     Args:
         folder: Folder of the model, created where it is missing.
-        policy: Policy whose class attribute `architecture` is the registered name.
+        policy: Policy with the registered name as class attribute `architecture`.
         config: Settings that the policy is built with when loaded, values that JSON has.
         card: Text of README.md; empty = a line that says that the origin is unknown.
         weights: Tensors by name; None = the policy's state dict, or no weights file for a policy that is no nn.Module.
@@ -155,7 +155,7 @@ def read_model(folder: str | os.PathLike, *, architecture: str | None = None) ->
     Raises:
         ConfigError: There is no such folder.
         CheckpointError: The folder holds no model, is damaged, belongs to a run that has not finished, or holds
-            another architecture.
+            a different architecture.
     """
     path = find_model(folder)
     try:

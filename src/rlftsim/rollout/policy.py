@@ -167,11 +167,11 @@ class Policy(Protocol):
     Contexts and states are opaque values of the policy's classes, except that a state has two attributes:
 
     * `poses` [B, N, A, t, 3]: x, y, heading of the steps of the last decision in the map frame; None before the first.
-    * `draws` [B, N, ...]: what `begin` drew from its noise, once per rollout; None for most policies. A single
+    * `draws` [B, N, ...]: values that `begin` drew from the noise, once per rollout; None for most policies. A single
       tensor, which all other code slices along B and N and hands back to `score` as `Rollouts.draws`. Several values
       are packed along the last axis: 16 latent numbers and the index of a destination per agent are float32
       [B, N, A, 17], where integers are exact up to 2^24. Log-probabilities are conditional on the draws, and the
-      draws themselves are not rewarded: training changes what is decided given a latent, not how latents are drawn.
+      draws are not rewarded: training changes decisions given a latent, not how latents are drawn.
     """
 
     steps_per_decision: int

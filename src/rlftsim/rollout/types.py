@@ -102,7 +102,7 @@ class Rollouts:
     decision: Tensor
     """[B, N, A, L, *event]; as sampled, never recovered from poses."""
     decision_mask: Bool[Tensor, "B N A L"]
-    """True = the policy chose it. False for padding, for agents that decide nothing any more, such as those that have
+    """True = the policy decided. False for padding, for agents that decide nothing any more, such as those that have
     left the map, and where all steps of the decision were forced."""
     log_prob: Float[Tensor, "B N A L"]
     """Under the distribution that was sampled from, nats; 0 where the mask is False."""

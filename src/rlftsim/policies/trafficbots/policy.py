@@ -1,6 +1,6 @@
 """TrafficBots as a policy: every agent chooses an acceleration and a yaw rate, eighty times.
 
-The network gives the mean mu_t of an action u_t (before tanh). The noise around it is correlated in time:
+The network gives the mean mu_t of an action u_t (before tanh). The noise around the mean is correlated in time:
 
     u_t | past ~ N(mu_t + rho (u_{t-1} - mu_{t-1}), (1 - rho^2) sigma^2),   at first N(mu_t, sigma^2)
 
@@ -24,7 +24,6 @@ from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
 from rlftsim.policies.trafficbots.network import NUM_CLASSES, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.scoring import compute_features
 from rlftsim.policies.trafficbots.state import (
     Memo,
     TrafficBotsContext,
@@ -177,8 +176,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
     ) -> tuple[GaussianDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
-        The features of agents are computed once where only `actions` differs, and not at all along rollouts that the
-        context has a record of.
+        The features of agents are computed once where only `actions` differs, and never along recorded rollouts.
 
         Args:
             context: Context of the scenarios under this policy.
@@ -228,9 +226,9 @@ class TrafficBotsPolicy(TrafficBotsModel):
     ) -> Float[Tensor, "B T N A D"]:
         """Features of agents in each of T states."""
         traffic = [state.traffic for state in states]
-        return compute_features(
-            self.network, join_history(traffic), torch.stack([t.active for t in traffic], 3), context.scene,
-            context.agent_context, states[0].conditioning, steps_per_pass=self.config.steps_per_pass,
+        return self.network.features_over_time(
+            join_history(traffic), torch.stack([t.active for t in traffic], 3), context.scene, context.agent_context,
+            states[0].conditioning, steps_per_pass=self.config.steps_per_pass,
         )  # fmt: skip
 
     def _score_states(
