@@ -242,7 +242,7 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
     Args:
         module: Module that receives the weights.
         weights: Tensors by name, as in the module's state dict.
-        source: File or folder of the weights, for the message.
+        source: File or folder of the weights, which the message of an error names.
 
     Raises:
         CheckpointError: A name, shape or type differs, or a weight is not finite; the message names the first few.
@@ -279,7 +279,7 @@ def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], 
     Args:
         weights: Tensors by name, as in a file.
         expected: State dict of the model; only names, shapes and types are read.
-        source: File or folder of the weights, for the message.
+        source: File or folder of the weights, which the message of an error names.
 
     Raises:
         CheckpointError: A name, shape or type differs; the message names the first few.
@@ -332,7 +332,7 @@ def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, s
     Args:
         make: Function that builds the network on torch's default device, which has no memory here.
         weights: Stored weights by name.
-        source: File or folder of the weights, for the message.
+        source: File or folder of the weights, which the message of an error names.
 
     Raises:
         CheckpointError: The weights have other names, shapes or number types.

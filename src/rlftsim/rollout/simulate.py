@@ -29,7 +29,7 @@ def sample_decision(
     Args:
         distribution: Distributions [B, N, A] of the next decision.
         state: State before the decision, not used here.
-        sampling: Temperature and truncation of the draw.
+        sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
         noise: Uniform numbers in [0, 1), `Policy.noise_size` per agent.
     """
     return distribution.sample(sampling, noise)

@@ -137,8 +137,8 @@ class SelfLayer(nn.Module):
         """Features after the layer, 0 for tokens that do not exist.
 
         Args:
-            x: Features of the tokens.
-            mask: True = the token exists.
+            x: Features of the tokens, D numbers each.
+            mask: True = the token exists; other tokens get features of 0.
             neighbors: Neighbors of each token among the tokens.
         """
         normal = self.norm(x)
@@ -173,8 +173,8 @@ class DecoderLayer(nn.Module):
         """Features after the layer, 0 for tokens that do not exist.
 
         Args:
-            x: Features of the tokens.
-            mask: True = the token exists.
+            x: Features of the tokens, D numbers each.
+            mask: True = the token exists; other tokens get features of 0.
             neighbors: Neighbors of each token among the tokens.
             sources: Targets of other types, from this layer's `project`, and the tokens' neighbors among these.
         """

@@ -70,7 +70,7 @@ def imitation_loss(
         network: Network with the weights. In training mode inputs are hidden and agents forced by schedule; in
             evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
         config: Settings with the schedule of forcing, and probabilities.
-        batch: Scenarios with logged futures.
+        batch: Scenarios with logged futures, the targets of imitation.
         trained: True = the agent counts; other agents are context.
         update: Number of the update of pre-training from 0.
     """
@@ -121,7 +121,7 @@ def compute_scene_loss(
     """Loss of a scene with random values that have been drawn.
 
     Args:
-        network: Network with the weights.
+        network: Network with the weights to be trained.
         config: Settings with `free_nats` and `steps_per_pass`.
         scene: Scene with all 91 steps of the log.
         destination: Label of each agent, a map token; negative = none.

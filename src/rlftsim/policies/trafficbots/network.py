@@ -139,7 +139,7 @@ class LightEncoder(nn.Module):
 
         Args:
             scene: Scene with lights and map.
-            map_features: Features from `MapEncoder`; receive no gradient from lights.
+            map_features: Features of the map tokens, from `MapEncoder`; receive no gradient from lights.
         """
         config, map_features = self.config, map_features.detach()
         lights = scene.light_pose
@@ -354,7 +354,7 @@ class DestinationPredictor(nn.Module):
         Args:
             windows: History [B, A, W] of the agents.
             scene: Scene with map and agents.
-            map_features: Features from `MapEncoder`; receive no gradient from the predictor.
+            map_features: Features of the map tokens, from `MapEncoder`; receive no gradient from the predictor.
             step_mask: Steps to look at; None = all valid steps.
         """
         agents = self.windows(windows, agent_attributes(scene), step_mask)  # [B, A, D]
@@ -482,7 +482,7 @@ class TrafficBotsNetwork(nn.Module):
 
         Args:
             scene: Scene with the map.
-            map_features: Features from `MapEncoder`; receive no gradient from here.
+            map_features: Features of the map tokens, from `MapEncoder`; receive no gradient from here.
             personality: Personality of each agent, 16 numbers.
             destination: Map token of each agent, negative = none.
         """

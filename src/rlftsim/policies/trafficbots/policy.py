@@ -70,8 +70,8 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """The current step, N times, with a personality and a destination for each agent.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            num_rollouts: Number N of simulations of each scenario.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            num_rollouts: Number N of simulations of each scenario, all in a single state.
             goals: Goals of agents, ignored: TrafficBots draws destinations.
             noise: Uniform numbers in [0, 1): 16 for the personality, the last for the destination.
         """
@@ -91,7 +91,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """The current step, with personalities and destinations that have been drawn.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             draws: Personality (16 numbers) and map token of the destination, -1 = none.
         """
         personality, destination = draws[..., :LATENT_SIZE], draws[..., LATENT_SIZE].long()
@@ -102,7 +102,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Distributions [B, N, A] of the next action.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             state: State before the decision; the memo in it is filled.
         """
         mean, residual = self._compute_mean(context, state), None
@@ -120,7 +120,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """State after 0.1 s of the chosen actions.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             state: State before the decision.
             decision: Actions before tanh: acceleration and yaw rate.
             forced: States of a single step imposed from outside; None = no agent is forced.
@@ -152,8 +152,8 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Distributions [B, N, A, T] along rollouts, in parallel over time.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            rollouts: Rollouts of the same scenarios.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            rollouts: Rollouts of the same scenarios, with decisions, forced states and draws.
         """
         replay = self._replay(context, rollouts)
         return self._score_states(context, replay, rollouts.decision, self._compute_features(context, replay))
@@ -180,7 +180,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
 
         Args:
             context: Context of the scenarios under this policy.
-            rollouts: Rollouts of the same scenarios.
+            rollouts: Rollouts of the same scenarios, with decisions, forced states and draws.
             reference: Policy of any class, scored without gradient.
             ref_context: Context of the scenarios under the reference.
             ref_rollouts: The same rollouts, maybe with goals, which TrafficBots ignores.
@@ -202,7 +202,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Loss of closed-loop imitation.
 
         Args:
-            scenarios: Scenarios with logged futures.
+            scenarios: Scenarios with logged futures, the targets of imitation.
             trained: True = the agent counts; other agents are context.
             update: Number of the update from 0; in training mode the fraction of agents that follow the log falls.
         """
