@@ -76,7 +76,7 @@ def clipped_edges(scenario: Scenario, reach_m: float = REACH_M) -> list[np.ndarr
     """Road edges inside the crop, each with the road on its left."""
     features, box = scenario.map_features, crop_box(scenario, reach_m)
     pieces = []
-    for index in features.indices_of(ROAD_EDGE_TYPES):
+    for index in features.find_indices(ROAD_EDGE_TYPES):
         line = shapely.LineString(features.polyline(index)[:, :2].astype(float))
         inside = shapely.line_merge(shapely.intersection(line, box))
         pieces += [shapely.get_coordinates(part) for part in shapely.get_parts(inside) if part.length > 0]
@@ -152,7 +152,7 @@ def map_archive(scenario: Scenario, reach_m: float = REACH_M) -> dict:
         return [int(other) for own, other in rows if own == lane]
 
     lanes = {}
-    for index in features.indices_of(LANE_TYPES):
+    for index in features.find_indices(LANE_TYPES):
         lane_id, center = int(features.feature_id[index]), features.polyline(index)[:, :2].astype(float)
         along = np.gradient(center, axis=0)
         normal = np.stack([-along[:, 1], along[:, 0]], 1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
@@ -169,7 +169,7 @@ def map_archive(scenario: Scenario, reach_m: float = REACH_M) -> dict:
             "centerline": [],
         }  # fmt: skip
     crossings = {}
-    for index in features.indices_of((MapFeatureType.CROSSWALK,)):
+    for index in features.find_indices((MapFeatureType.CROSSWALK,)):
         corner = features.polyline(index)[:, :2].astype(float)
         if len(corner) >= 4:
             number = str(features.feature_id[index])

@@ -99,7 +99,7 @@ def whole_number(name: str, value: object, least: int | None = None) -> int:
     return number
 
 
-def require_types(config: Any) -> None:
+def check_types(config: Any) -> None:
     """Require that each field of a configuration has a value of its type, and a choice one of its words.
 
     Numbers of numpy become plain ones, so that every configuration can be stored as JSON.
@@ -120,7 +120,7 @@ def require_types(config: Any) -> None:
             object.__setattr__(config, one.name, fitted)  # the dataclasses are frozen
 
 
-def require_positive(config: object, names: tuple[str, ...]) -> None:
+def check_positive(config: object, names: tuple[str, ...]) -> None:
     """Require that fields of a configuration are above zero.
 
     Args:
@@ -135,7 +135,7 @@ def require_positive(config: object, names: tuple[str, ...]) -> None:
             raise ConfigError(f"{name} must be positive, got {getattr(config, name)}.")
 
 
-def require_not_negative(config: object, names: tuple[str, ...]) -> None:
+def check_not_negative(config: object, names: tuple[str, ...]) -> None:
     """Require that fields of a configuration are zero or more.
 
     Args:
@@ -150,7 +150,7 @@ def require_not_negative(config: object, names: tuple[str, ...]) -> None:
             raise ConfigError(f"{name} must not be negative, got {getattr(config, name)}.")
 
 
-def require_finite(config: object, names: tuple[str, ...]) -> None:
+def check_finiteness(config: object, names: tuple[str, ...]) -> None:
     """Require that fields of a configuration are finite numbers.
 
     Args:

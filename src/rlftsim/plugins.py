@@ -136,13 +136,13 @@ class ExtensionPoint(Generic[Value]):
         entries = list(entry_points(group=self.group))
         announced = [one for one in entries if one.name == name]
         for entry in announced or entries:
-            problem = self.problem_of(entry)
+            problem = self.describe_problem(entry)
             if problem and announced:
                 raise ConfigError(problem)
             if problem:
                 warnings.warn(problem, stacklevel=4)
 
-    def problem_of(self, entry: EntryPoint) -> str | None:
+    def describe_problem(self, entry: EntryPoint) -> str | None:
         """Add an entry point to the table unless it is there; one line about its failure, None = it works."""
         if entry.name in self._registered:
             return None
@@ -164,7 +164,7 @@ class ExtensionPoint(Generic[Value]):
                 return str(error)
         return None
 
-    def refusal_of(self, name: str) -> str | None:
+    def describe_refusal(self, name: str) -> str | None:
         """One line about a registered thing that is refused where it is used; None = it works."""
         # An entry point that is a module has a name of its own, under which there may be nothing.
         if self._use is None or name not in self._registered:

@@ -158,9 +158,12 @@ BAD = [
     (["tokens", "--recipe", "smarttiny", "--data", "d"], "unknown recipe 'smarttiny': did you mean 'smart-tiny'"),
     (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
     (["doctor", "--nodes", "4"], "^--nodes has no effect: add --plan evaluate"),
-    (["join"], "^join: write the command of a share behind join, .* are convert, evaluate, score, submit build, synth"),
+    (
+        ["join"],
+        "^join: write the command of a share behind join, .* are augment, convert, evaluate, score, simulate,",
+    ),
     (["join", "foo"], "^join foo: write the command of a share behind join"),
-    (["join", "simulate", "--help"], "^join simulate --help: write the command of a share behind join"),
+    (["join", "pretrain", "--help"], "^join pretrain --help: write the command of a share behind join"),
     (["join", "submit", "check"], "^join submit check: write the command of a share behind join"),
     (["join", "convert", "a", "b", "--share", "1/2"], "^join convert a: write .* without --share"),
     (

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rlftsim.evaluation.columns import COLUMNS, GOAL_COLUMNS, SCORES, TERMINAL_GOAL_COLUMNS, direction_of
+from rlftsim.evaluation.columns import COLUMNS, GOAL_COLUMNS, SCORES, TERMINAL_GOAL_COLUMNS, find_direction
 from rlftsim.evaluation.results import SCORE_COLUMNS
 from rlftsim.statistics import interval_around
 
@@ -20,7 +20,7 @@ def test_labels_have_unit_and_direction():
     assert [rmm.label, min_ade.label, collision.label] == ["RMM ↑", "minADE [m] ↓", "collision [%] ↓"]
     assert [rmm.fraction_label, min_ade.fraction_label] == ["RMM ↑", "minADE [m] ↓"]
     assert collision.fraction_label == "collision rate ↓"
-    assert direction_of("average_displacement_error") == "lower"
+    assert find_direction("average_displacement_error") == "lower"
 
 
 @pytest.mark.parametrize(

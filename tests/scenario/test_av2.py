@@ -122,7 +122,7 @@ def test_the_map_of_the_sample_is_counted(sample):
     features, ground = read_map(path)
     kinds = features.feature_type
     assert (kinds == MapFeatureType.LANE_BIKE).sum() == 37
-    assert len(features.indices_of(LANE_TYPES)) == 71
+    assert len(features.find_indices(LANE_TYPES)) == 71
     assert features.topology.interpolating.sum() == 32
     lanes = archive["lane_segments"].values()
     sides = [
@@ -226,7 +226,8 @@ def test_synthetic_scenarios_come_back_from_files_of_this_shape(pack, tmp_path):
         # 3. The ground: random places are on the same side, and the road is left of every edge.
         _, ground = read_map(next(place.glob("*.json")))
         edges = [
-            found.map_features.polyline(k)[:, :2].astype(float) for k in found.map_features.indices_of(ROAD_EDGE_TYPES)
+            found.map_features.polyline(k)[:, :2].astype(float)
+            for k in found.map_features.find_indices(ROAD_EDGE_TYPES)
         ]
         x0, y0, x1, y1 = crop_box(scenario).bounds
         places = rng.uniform((x0, y0), (x1, y1), (250, 2))  # 10 000 in all
@@ -442,4 +443,4 @@ def test_damaged_files_never_end_in_a_traceback(small_files, data):
         scenario, _ = read_one(place)
     except DataError:
         return
-    scenario.refuse_not_finite()
+    scenario.check_finite_arrays()

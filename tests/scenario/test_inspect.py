@@ -70,7 +70,7 @@ def test_a_state_that_is_no_number_is_found_and_never_written(make_dataset, make
         write_dataset([scenario], tmp_path / "refused")
     assert not (tmp_path / "refused").exists()
     with monkeypatch.context() as other_writer:
-        other_writer.setattr(Scenario, "refuse_not_finite", lambda _: None)
+        other_writer.setattr(Scenario, "check_finite_arrays", lambda _: None)
         write_dataset([scenario], tmp_path / "data")
     assert found(tmp_path / "data") == [(Problem.NOT_FINITE, "a")]
     (finding,) = verify_dataset(tmp_path / "data")
@@ -81,7 +81,7 @@ def test_a_state_that_is_no_number_is_found_and_never_written(make_dataset, make
 def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, monkeypatch):
     scenario = scenario_from_bytes(make_message("a").SerializeToString())
     with monkeypatch.context() as other_writer:
-        other_writer.setattr(Scenario, "refuse_broken", lambda _: None)
+        other_writer.setattr(Scenario, "check_consistency", lambda _: None)
         write_dataset(
             [replace(scenario, tracks=replace(scenario.tracks, object_id=np.array([7, 7, 8])))], tmp_path / "data"
         )
@@ -104,7 +104,7 @@ def test_a_time_base_and_ids_that_an_earlier_version_took_are_found(make_message
     with pytest.raises(DataError, match=cause):
         write_dataset([scenario], tmp_path / "refused")
     with monkeypatch.context() as earlier_version:
-        earlier_version.setattr(Scenario, "refuse_broken", lambda _: None)
+        earlier_version.setattr(Scenario, "check_consistency", lambda _: None)
         write_dataset([scenario], tmp_path / "data")
     (finding,) = verify_dataset(tmp_path / "data")
     assert str(finding).startswith(f"broken scenario: a: {cause}")
@@ -140,7 +140,7 @@ def test_a_map_in_another_frame_and_positions_beyond_float32_are_found(
     scenario.tracks.position[..., 1] += 4_649_000.0
     scenario.map_features.points[:, 1] += 4_649_000.0
     with monkeypatch.context() as other_writer:
-        other_writer.setattr(Scenario, "refuse_coarse", lambda _: None)
+        other_writer.setattr(Scenario, "check_precision", lambda _: None)
         write_dataset([scenario], tmp_path / "older")
     assert (Problem.FAR_FROM_ORIGIN, "utm") in found(tmp_path / "older")
 

@@ -253,7 +253,7 @@ def test_the_commonroad_script_writes_the_tables(tmp_path, version):
     assert scenario.guessed == {"ego", "edges", "predict", "size", "z"}
     features = scenario.map_features
     # the curbs right and left of the lane, without its two ends
-    edges = [features.polyline(k) for k in features.indices_of((MapFeatureType.EDGE_BOUNDARY,))]
+    edges = [features.polyline(k) for k in features.find_indices((MapFeatureType.EDGE_BOUNDARY,))]
     assert sorted(float(edge[0, 1]) for edge in edges) == [-2.0, 2.0]
     assert {float(edge[0, 1]): edge[-1, 0] > edge[0, 0] for edge in edges} == {-2.0: True, 2.0: False}
 

@@ -27,9 +27,9 @@ from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.submission.build import build_archive, delete_parts, forecast_size
 from rlftsim.submission.check import check_archive
-from rlftsim.submission.closed_loop import refuse_open_loop, statement
+from rlftsim.submission.closed_loop import check_closed_loop, statement
 from rlftsim.submission.messages import round_states
-from rlftsim.submission.plan import refuse_incomplete, refuse_other_sources
+from rlftsim.submission.plan import check_complete, check_sources
 
 NUM_SHARDS = 6
 
@@ -267,25 +267,25 @@ def test_a_step_that_is_none_is_refused_before_a_folder_is_claimed(data, tmp_pat
 
 def test_a_split_with_a_missing_file_is_refused(tmp_path):
     data = entries.write_data(tmp_path / "set")
-    refuse_incomplete(data)
+    check_complete(data)
     (shard,) = data.folder.glob("shards/*.arrow")
     shard.rename(tmp_path / "gone")
     with pytest.raises(DataError, match=r"00000\.arrow is missing, and 0 more: convert again"):
-        refuse_incomplete(data)
+        check_complete(data)
     (tmp_path / "gone").rename(shard)
     # as `rlftsim convert` writes the manifest of the files 0 and 2 of 3
     entry = replace(data.manifest.shards[0], split="testing")
     names = [f"testing.tfrecord-{number:05d}-of-00003" for number in (0, 2)]
     data.manifest = replace(data.manifest, shards=tuple(replace(entry, source=name) for name in names))
     with pytest.raises(DataError, match=r"from 2 of 3 files, testing\.tfrecord-00001-of-00003 is missing"):
-        refuse_incomplete(data)
+        check_complete(data)
 
 
 def test_recordings_of_others_are_refused(tmp_path):
-    refuse_other_sources(entries.write_data(tmp_path / "set"))
+    check_sources(entries.write_data(tmp_path / "set"))
     write_dataset(replace(scenes.straight_road(), source="av2"), tmp_path / "foreign")
     with pytest.raises(DataError, match="scenarios of the source av2: the Sim Agents server scores WOMD alone"):
-        refuse_other_sources(ScenarioDataset(tmp_path / "foreign"))
+        check_sources(ScenarioDataset(tmp_path / "foreign"))
 
 
 class Slow(ConstantVelocity):
@@ -321,16 +321,16 @@ class Foreseeing(ConstantVelocity):
 def test_policies_that_are_no_closed_loop_are_refused():
     drawn = scenes.straight_road()
     with pytest.raises(ConfigError, match="change where the logged future is taken away"):
-        refuse_open_loop(Foreseeing(), drawn)
-    refuse_open_loop(Foreseeing(), scenes.without_future())  # there is nothing to foresee
+        check_closed_loop(Foreseeing(), drawn)
+    check_closed_loop(Foreseeing(), scenes.without_future())  # there is nothing to foresee
     (found,) = check_policy(Foreseeing(), [drawn]).failures
     assert found.rule == "rollouts do not depend on the logged future"
     with pytest.raises(ConfigError, match=r"decides every 1\.6 s: the challenge wants an inference call at least once"):
-        refuse_open_loop(Slow(), drawn)
+        check_closed_loop(Slow(), drawn)
     with pytest.raises(ConfigError, match="the ego shares with other agents"):
-        refuse_open_loop(Drawing(shared=True), drawn)
-    refuse_open_loop(Drawing(shared=False), drawn)
-    refuse_open_loop(ConstantVelocity(), drawn)
+        check_closed_loop(Drawing(shared=True), drawn)
+    check_closed_loop(Drawing(shared=False), drawn)
+    check_closed_loop(ConstantVelocity(), drawn)
     config = entries.make_job(ScenarioDataset("synthetic", "validation"), Path()).config
     assert "decides every 0.1 s, 80 times in 8 s" in statement(ConstantVelocity(), config.sampling)
 

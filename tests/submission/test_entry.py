@@ -7,7 +7,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
-from rlftsim.submission.entry import REQUIRED_FIELDS, count_parameters, describe_entry, problems_of, read_entry
+from rlftsim.submission.entry import REQUIRED_FIELDS, count_parameters, describe_entry, find_problems, read_entry
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def read(tmp_path):
 def test_a_file_becomes_all_required_fields(read):
     entry = read(TOML, method="Another")
     message = SimAgentsChallengeSubmission.FromString(describe_entry(entry, "7M"))
-    assert problems_of(message) == []
+    assert find_problems(message) == []
     assert all(message.HasField(name) for name in REQUIRED_FIELDS)
     assert (message.unique_method_name, message.submission_type, message.uses_lidar_data) == ("Another", 1, False)
 

@@ -17,7 +17,7 @@ from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.jobs.buckets import validate_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling
-from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 
 ORACLE = "oracle"
@@ -78,7 +78,7 @@ def evaluate(
         subject = policy_of(policy)
         name = name or f"{type(policy).__name__}-{fingerprint_policy(policy)[:8]}"
     # 3. Scores.
-    scenarios = scenarios_of(data)
+    scenarios = to_scenarios(data)
     with contextlib.ExitStack() as stack:
         temporary = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rlftsim-")))
         if isinstance(scenarios, ScenarioDataset):

@@ -10,7 +10,7 @@ from rlftsim.rollout.check import CheckReport
 from rlftsim.rollout.check import check_policy as check_contract
 from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.notebook import check_rollouts
@@ -85,6 +85,6 @@ def check_policy(
     Raises:
         ConfigError: no policy, or no scenario.
     """
-    found = scenarios_of(scenarios)
+    found = to_scenarios(scenarios)
     tried = [found[position] for position in range(len(found))]
     return check_contract(policy_of(policy), tried, reference=None if reference is None else policy_of(reference))

@@ -9,7 +9,7 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.policies import registry
 from rlftsim.policies.registry import Device
 from rlftsim.rollout.policy import Policy
-from rlftsim.scenario.any_form import Name, scenarios_of
+from rlftsim.scenario.any_form import Name, to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset
@@ -90,7 +90,7 @@ def batch_of(scenarios: Any, device: torch.device | str = "cpu") -> ScenarioBatc
         ConfigError: there is none, or something else was handed over.
         DataError: no data set of this name, or an unsound scenario.
     """
-    found = scenarios_of(scenarios)
+    found = to_scenarios(scenarios)
     if not isinstance(scenarios, ScenarioBatch):
         scenarios = collate([found[position] for position in range(len(found))])
     return scenarios.to(device)

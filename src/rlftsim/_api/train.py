@@ -16,7 +16,7 @@ from rlftsim.recipes.calibration import prepare_policy
 from rlftsim.recipes.card import model_card, with_cards_of
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.policy import Policy, get_device
-from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
@@ -75,7 +75,7 @@ def pretrain(
         NotYetError: another run is at work in `out`.
     """
     _require_config(config, "pretrain", PretrainConfig)
-    training = scenarios_of(scenarios, "training")
+    training = to_scenarios(scenarios, "training")
     if isinstance(policy, str) and policy in RECIPES.names():
         policy = recipe_by_name(policy)
     if isinstance(policy, Recipe):
@@ -87,7 +87,7 @@ def pretrain(
         start = policy_of(policy)
         card = _card("pre-trained further", training, policy)
     settings = config or PretrainConfig()
-    validation = None if held_out is None else scenarios_of(held_out)
+    validation = None if held_out is None else to_scenarios(held_out)
     return _train_copy(
         start,
         out,
@@ -123,7 +123,7 @@ def finetune(
         NotYetError: another run is at work in `out`.
     """
     _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
-    training, settings = scenarios_of(scenarios, "training"), config or FinetuneConfig()
+    training, settings = to_scenarios(scenarios, "training"), config or FinetuneConfig()
     card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
     start = prepare_policy(policy_of(policy), settings)
     return _train_copy(

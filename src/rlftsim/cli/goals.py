@@ -18,7 +18,7 @@ from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_wide
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import dataset_folder, refuse_unknown
+from rlftsim.scenario.open import check_splits, dataset_folder
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 from rlftsim.viewer.figure import check_picture_path
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
@@ -63,7 +63,7 @@ class Propose:
         scenarios = ScenarioDataset(dataset_folder(self.data))
         goals, alternatives, panels = [], [], []
         for scenario_id in dict.fromkeys(self.scenario):
-            refuse_unknown(scenarios, scenario_id, self.data, "--scenario")
+            check_splits(scenarios, scenario_id, self.data, "--scenario")
             scenario = scenarios.by_id(scenario_id)
             table = Table(title=f"scenario {scenario.scenario_id}", title_justify="left")
             for heading in ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]"):
@@ -148,7 +148,7 @@ class Check:
         scenarios, file = ScenarioDataset(dataset_folder(self.data)), read_goals(self.file)
         lines = []
         for entry in (*file.goals, *file.alternatives):
-            refuse_unknown(scenarios, entry.scenario_id, self.data, entry)
+            check_splits(scenarios, entry.scenario_id, self.data, entry)
             lines += goal_warnings(entry, scenarios.by_id(entry.scenario_id))
         for line in lines:
             print(line)

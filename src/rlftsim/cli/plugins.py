@@ -48,7 +48,7 @@ def list_plug_ins() -> list[PlugIn]:
             # The group itself may need an extra that is not installed.
             try:
                 point = getattr(importlib.import_module(module), attribute)
-                problem = point.problem_of(entry) or point.refusal_of(entry.name)
+                problem = point.describe_problem(entry) or point.describe_refusal(entry.name)
             except ConfigError as error:
                 problem = str(error)
             package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")

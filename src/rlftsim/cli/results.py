@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.compare import columns_of, compare, format_comparison, format_table
+from rlftsim.evaluation.compare import compare, format_comparison, format_table, select_columns
 from rlftsim.evaluation.drive_results import DriveResult, format_drive_comparison, format_drives, is_drive_result
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate, evaluation_name
 from rlftsim.evaluation.explain_page import explain_rollouts
@@ -136,5 +136,5 @@ class Compare:
             return 0
         a, b = Evaluation.read(self.first), Evaluation.read(self.second)
         comparison = compare(a, b, alpha=self.alpha)
-        print_wide(format_table(a, b), format_comparison(comparison, columns=columns_of(a, b)))
+        print_wide(format_table(a, b), format_comparison(comparison, columns=select_columns(a, b)))
         return 0

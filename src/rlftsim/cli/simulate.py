@@ -18,7 +18,7 @@ from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.policy import Sampling, get_device, is_goal_conditioned
 from rlftsim.rollout.simulate import check_sampling
-from rlftsim.scenario.open import open_dataset, refuse_unknown
+from rlftsim.scenario.open import check_splits, open_dataset
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,7 @@ class Simulate:
         ids = list(dict.fromkeys(self.scenario or goals.scenario_ids or scenarios.scenario_ids))[: self.limit]
         for scenario_id in ids:
             entries = goals.of_scenario(scenario_id)
-            refuse_unknown(
-                scenarios, scenario_id, self.data, "--scenario" if self.scenario else next(iter(entries), "")
-            )
+            check_splits(scenarios, scenario_id, self.data, "--scenario" if self.scenario else next(iter(entries), ""))
             if entries:
                 warn_of_doubts(entries, scenarios.by_id(scenario_id))
             elif goals.goals:

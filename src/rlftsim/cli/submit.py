@@ -21,10 +21,17 @@ from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.build import Job, build_archive, delete_parts
 from rlftsim.submission.check import ArchiveCheck, check_archive
-from rlftsim.submission.closed_loop import refuse_open_loop, statement
+from rlftsim.submission.closed_loop import check_closed_loop, statement
 from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
-from rlftsim.submission.plan import make_plan, refuse_incomplete, refuse_other_sources
-from rlftsim.submission.report import Report, estimate_realism, findings_of, model_card, reported_sha256, write_findings
+from rlftsim.submission.plan import check_complete, check_sources, make_plan
+from rlftsim.submission.report import (
+    Report,
+    estimate_realism,
+    model_card,
+    reported_sha256,
+    select_findings,
+    write_findings,
+)
 from rlftsim.submission.scores import ArchiveScores
 from rlftsim.submission.transfer import split_file
 
@@ -95,10 +102,10 @@ class Build:
             seed=self.seed, temperature=self.temperature, top_k=self.top_k,
             split=self.split, rollouts_per_pass=self.rollouts_per_pass, jobs=self.jobs,
         )  # fmt: skip
-        refuse_other_sources(data)
+        check_sources(data)
         if not self.partial:
-            refuse_incomplete(data)
-        refuse_open_loop(policy, data[0])
+            check_complete(data)
+        check_closed_loop(policy, data[0])
         check_sampling(policy, data, config.sampling)
         closed_loop = statement(policy, config.sampling)
         print(closed_loop)
@@ -118,7 +125,7 @@ class Build:
         # 3. check the file that will be uploaded, and report
         check = check_archive(archive, data)
         evaluation = self.evaluation or EVALUATIONS / f"{evaluation_name(self.model)}.parquet"
-        findings, counts = findings_of(check)
+        findings, counts = select_findings(check)
         work = {"model": self.model, "data set": str(data.folder), **plan.identity}
         report = Report(
             archive.name, check.size, check.sha256, entry.method, parameters, len(check.shards), check.num_scenarios,

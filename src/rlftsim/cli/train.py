@@ -18,7 +18,7 @@ from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.base import Recipe
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import open_dataset, splits_of
+from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.goal_relabeling import NOT_VALIDATED
 from rlftsim.training.parallel import is_first_process
@@ -248,7 +248,7 @@ def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | Non
         raise ConfigError(f"--validation-split {split} has no effect: set validation.every to a number of updates.")
     if not every:
         return None
-    if split is None and VALIDATION not in splits_of(data):
+    if split is None and VALIDATION not in list_splits(data):
         log.info(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
         return None
     return open_dataset(data, split or VALIDATION)

@@ -9,7 +9,7 @@ from rlftsim.envs.drivers import Rules, Traffic
 from rlftsim.envs.observations import Frame
 from rlftsim.envs.rewards import parse_terms
 from rlftsim.envs.route import RouteChoice
-from rlftsim.errors import ConfigError, in_short, require_types
+from rlftsim.errors import ConfigError, check_types, in_short
 from rlftsim.policies.registry import Device
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.types import FUTURE_STEPS
@@ -60,7 +60,7 @@ class EnvConfig:
     render_mode: RenderMode | None = None
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if not isinstance(self.drivers, Mapping):
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
         parse_terms(self.reward)

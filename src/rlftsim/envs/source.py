@@ -15,9 +15,9 @@ from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
-from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, to_scenarios
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
+from rlftsim.scenario.types import Scenario, Scenarios, list_scenario_ids
 
 KEPT_CONTEXTS = 16
 """Encoded scenarios that are kept: encoding is most of the cost of a reset."""
@@ -51,8 +51,8 @@ class Source:
                 "policy is in training mode, in which dropout makes traffic of one seed differ: call policy.eval()."
             )
         self.config = config
-        self.scenarios: Scenarios = scenarios_of(scenarios if scenarios is not None else config.data, config.split)
-        self.scenario_ids = list(scenario_ids_of(self.scenarios))
+        self.scenarios: Scenarios = to_scenarios(scenarios if scenarios is not None else config.data, config.split)
+        self.scenario_ids = list(list_scenario_ids(self.scenarios))
         self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}
         self.rules.setdefault("*", config.traffic)
         # IDM leaves pedestrians and cyclists to the policy

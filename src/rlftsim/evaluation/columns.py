@@ -10,7 +10,7 @@ from rlftsim.statistics import MeanInterval
 ARROWS = {"higher": " ↑", "lower": " ↓", "log": ""}
 
 
-def direction_of(source: str) -> Literal["higher", "lower", "log"]:
+def find_direction(source: str) -> Literal["higher", "lower", "log"]:
     """The better direction of a column of an evaluation: errors and rates are better lower, what is measured as drift
     is best where it is nearest to the log's own, all others are better higher."""
     if source.endswith(("_error", "_rate")):
@@ -34,20 +34,20 @@ class Column:
     @property
     def better(self) -> str:
         """The better direction in words."""
-        direction = direction_of(self.source)
+        direction = find_direction(self.source)
         return "best near the log's" if direction == "log" else f"{direction} is better"
 
     @property
     def label(self) -> str:
         """Heading with the unit and, where there is one, an arrow in the better direction."""
-        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''}{ARROWS[direction_of(self.source)]}"
+        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''}{ARROWS[find_direction(self.source)]}"
 
     @property
     def fraction_label(self) -> str:
         """As `label`, for tables that show rates as fractions."""
         if self.unit != "%":
             return self.label
-        return f"{self.rate_heading or f'{self.heading} rate'}{ARROWS[direction_of(self.source)]}"
+        return f"{self.rate_heading or f'{self.heading} rate'}{ARROWS[find_direction(self.source)]}"
 
     def text(self, number: float) -> str:
         """A number in the column's unit and digits."""

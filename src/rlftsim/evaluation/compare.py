@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, direction_of
+from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, find_direction
 from rlftsim.evaluation.results import LABELS, SCORE_COLUMNS, Evaluation
 from rlftsim.statistics import cluster_bootstrap, mean_interval
 
@@ -68,7 +68,7 @@ class PairedDifference:
         numbers = f"{self.difference:+.4f}, {level:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
         if not self.is_difference:
             return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
-        direction = direction_of(self.column)
+        direction = find_direction(self.column)
         if direction == "log":  # neither more nor less is better
             return f"difference: {numbers}."
         is_better = (self.difference > 0) == (direction == "higher")
@@ -245,7 +245,7 @@ def compare_paired(
     )
 
 
-def columns_of(*evaluations: Evaluation) -> tuple[Column, ...]:
+def select_columns(*evaluations: Evaluation) -> tuple[Column, ...]:
     """Columns of a table of some evaluations: with misses where agents of some evaluation had goals."""
     have_goals = any(evaluation.config.goals != "none" for evaluation in evaluations)
     return TERMINAL_GOAL_COLUMNS if have_goals else TERMINAL_COLUMNS
@@ -261,9 +261,9 @@ def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = No
 
     Args:
         evaluations: the rows.
-        columns: None = `columns_of` the evaluations.
+        columns: None = `select_columns` the evaluations.
     """
-    columns = columns or columns_of(*evaluations)
+    columns = columns or select_columns(*evaluations)
     with_goals = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
     notes = list(dict.fromkeys(evaluation.data_note for evaluation in evaluations))
     if with_goals:

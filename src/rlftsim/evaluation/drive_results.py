@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.table import Table
 
-from rlftsim.errors import DataError, require_types
-from rlftsim.evaluation.columns import ARROWS, direction_of, format_number
+from rlftsim.errors import DataError, check_types
+from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import write_atomically
@@ -117,11 +117,11 @@ class DriveResult:
             if about["format"] != FORMAT:
                 raise ValueError(f"its format is {str(about['format'])[:40]}, not {FORMAT}")
             settings = DriveSettings(**about["settings"])
-            require_types(settings)
+            check_types(settings)
             missing = {name: dict(reasons.items()) for name, reasons in about["missing"].items()}
             if not all(isinstance(why, str) for reasons in missing.values() for why in reasons.values()):
                 raise TypeError("a reason is no text")
-            _require_columns(table)
+            _check_columns(table)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             cause = str(error).partition("\n")[0].rstrip(".")
             if isinstance(error, KeyError):
@@ -132,7 +132,7 @@ class DriveResult:
         return cls(settings, table.replace_schema_metadata(None), missing)
 
 
-def _require_columns(table: pa.Table) -> None:
+def _check_columns(table: pa.Table) -> None:
     """Require what tables and comparisons read: a text for each scenario, and numbers.
 
     Raises:
@@ -204,7 +204,7 @@ def format_drives(*results: DriveResult) -> Table:
             + (f" ± {format_number(mean.standard_error, 4)}" if mean.count > 1 else "")
             for mean in means
         ]  # fmt: skip
-        table.add_row(f"{name} {ARROWS[direction_of(name)]}", *cells)
+        table.add_row(f"{name} {ARROWS[find_direction(name)]}", *cells)
     return table
 
 
@@ -225,6 +225,6 @@ def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> 
     table.add_column("verdict")
     for row in compare_drives(a, b, alpha=alpha):
         if row.column in SHOWN and row.count:
-            label = f"{row.column} {ARROWS[direction_of(row.column)]}"
+            label = f"{row.column} {ARROWS[find_direction(row.column)]}"
             table.add_row(label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", row.verdict)
     return table

@@ -248,8 +248,8 @@ def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
     """Row of one scenario, or why there is none."""
     scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
-        scenario.refuse_broken()
-        scenario.refuse_not_finite()
+        scenario.check_consistency()
+        scenario.check_finite_arrays()
     except DataError as error:
         # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
         raise DataError(

@@ -16,8 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError, require_types
-from rlftsim.evaluation.columns import SCORES, direction_of
+from rlftsim.errors import ConfigError, DataError, check_types
+from rlftsim.evaluation.columns import SCORES, find_direction
 from rlftsim.evaluation.drift import Drift, measure_drift
 from rlftsim.jobs.documents import describe_type, parse_json
 from rlftsim.jobs.files import write_atomically
@@ -104,7 +104,7 @@ class EvaluateConfig:
     """Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         for name in ("num_rollouts", "rollouts_per_pass", "jobs", "limit"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -310,7 +310,7 @@ class Evaluation:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         try:
             provenance = Provenance.from_plain(about["provenance"])
-            require_types(provenance)
+            check_types(provenance)
         except (TypeError, KeyError, AttributeError, ConfigError) as error:
             error = "a value of another type" if isinstance(error, AttributeError) else error
             raise DataError(f"{path}: made by a later version ({error}): update rlftsim or evaluate again.") from None
@@ -326,7 +326,7 @@ def _check_scores(table: pa.Table) -> None:
     for name in table.schema.names:
         if table[name].type == pa.string():
             continue
-        direction = direction_of(name)
+        direction = find_direction(name)
         # likelihoods and rates are in [0, 1] but for rounding, errors and counts not below 0, drift is any number
         lowest = -LARGEST if direction == "log" and not name.startswith("num_") else 0.0
         is_fraction = name.endswith("_rate") or (direction == "higher" and not name.startswith("num_"))

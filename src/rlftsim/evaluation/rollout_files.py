@@ -63,7 +63,7 @@ def find_rollouts(source: str | PathLike[str]) -> list[RolloutEntry]:
     """
     source = Path(source)
     if source.is_file():
-        return list(_entries_of(source))
+        return list(_list_entries(source))
     if not source.is_dir():
         raise DataError(f"{source}: there is no such file or folder of rollouts.")
     # hidden files are those that a writer has not finished, or an editor's
@@ -74,7 +74,7 @@ def find_rollouts(source: str | PathLike[str]) -> list[RolloutEntry]:
         raise _pickle_error(pickles[0])
     if not files:
         raise DataError(f"{source}: no rollouts in this folder, neither *.npz nor *.binproto: {FORMATS_NOTE}.")
-    return [entry for path in files for entry in _entries_of(path)]
+    return [entry for path in files for entry in _list_entries(path)]
 
 
 def read_states(entry: RolloutEntry) -> SimulatedStates:
@@ -111,7 +111,7 @@ def _pickle_error(path: Path) -> DataError:
     )
 
 
-def _entries_of(path: Path) -> list[RolloutEntry]:
+def _list_entries(path: Path) -> list[RolloutEntry]:
     try:
         with path.open("rb") as file:
             magic = file.read(4)

@@ -194,7 +194,7 @@ def index_tfrecords(source: Path) -> LoggedScenarios:
         # A record is length (8 bytes), checksum (4), data, checksum (4): its data begin after a header of 12 bytes.
         offset = 0
         for record, data in read_records(path):
-            scenario_id = _scenario_id_of(data)
+            scenario_id = _find_scenario_id(data)
             if scenario_id is None:
                 raise DataError(f"{path}: record {record}: not a WOMD Scenario message, it has no scenario_id")
             # of a scenario that occurs twice the first is taken, as by the converter
@@ -204,7 +204,7 @@ def index_tfrecords(source: Path) -> LoggedScenarios:
     return LoggedScenarios(places, digest.hexdigest())
 
 
-def _scenario_id_of(record: bytes) -> str | None:
+def _find_scenario_id(record: bytes) -> str | None:
     # Field by field: parsing the whole message would decode its map and all tracks.
     try:
         for field in iterate_fields(io.BytesIO(record), 0, len(record)):

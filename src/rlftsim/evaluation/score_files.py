@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from rich.table import Table
 
-from rlftsim.errors import ConfigError, DataError, require_types
-from rlftsim.evaluation.columns import ARROWS, direction_of
+from rlftsim.errors import ConfigError, DataError, check_types
+from rlftsim.evaluation.columns import ARROWS, find_direction
 from rlftsim.evaluation.results import (
     SCORE_COLUMNS,
     EvaluateConfig,
@@ -57,7 +57,7 @@ class ScoreConfig:
     """Processes, each with one thread; left out, as many as there are cores. Changes no result."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         for name in ("limit", "jobs"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -172,7 +172,7 @@ def format_scores(evaluation: Evaluation) -> Table:
         label = "meta_metric, traffic light term set to 1" if column == "meta_metric_light_one" else column
         spread = "" if math.isnan(mean.standard_error) else f"± {mean.standard_error:.4f}"
         table.add_row(
-            f"{label}{ARROWS[direction_of(column)]}", f"{mean.mean:.4f}", spread, str(mean.count), metric.name
+            f"{label}{ARROWS[find_direction(column)]}", f"{mean.mean:.4f}", spread, str(mean.count), metric.name
         )
     return table
 

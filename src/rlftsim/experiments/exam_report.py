@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, direction_of
+from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, find_direction
 from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
 from rlftsim.experiments import tables
 from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Margin
@@ -61,7 +61,7 @@ def format_change(change: PairedDifference, column: Column) -> str:
     """Difference with interval in the column's unit, and a word where chance does not explain the difference."""
     if not math.isfinite(change.difference):
         return "–"
-    direction = direction_of(column.source)
+    direction = find_direction(column.source)
     is_gain = (change.difference > 0) == (direction == "higher")
     word = " (changed)" if direction == "log" else " (better)" if is_gain else " (worse)"
     numbers = f"{format_signed(column, change.difference)} {format_interval(column, change.interval)}"

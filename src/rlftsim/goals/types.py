@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.scenario.batch import Frame, ScenarioBatch, origin_of
+from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
 from rlftsim.scenario.types import Scenario
 
 Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
@@ -166,7 +166,7 @@ def goals_at(points: Mapping[str, Points], batch: ScenarioBatch) -> Goals:
             _, agents, entries = np.intersect1d(simulated_ids, ids, return_indices=True)
             mask[row, agents] = True
             # The origin is subtracted in float64: float32 has steps of 0.5 mm at world coordinates of kilometers.
-            position[row, agents] = world_points[entries] - origin_of(scenario, batch.frame)
+            position[row, agents] = world_points[entries] - compute_origin(scenario, batch.frame)
     return Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask), batch.frame).to(batch.device)
 
 

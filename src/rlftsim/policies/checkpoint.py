@@ -74,10 +74,10 @@ class StoredModel:
         """
         # JSON has lists where settings have tuples.
         settings = {name: tuple(v) if isinstance(v, list) else v for name, v in self.config.items()}
-        cls: Any = make
         try:
-            if is_dataclass(cls):
-                _check_names(settings, {field.name for field in fields(cls) if field.init})
+            settings_type: Any = make
+            if is_dataclass(settings_type):
+                _check_names(settings, {field.name for field in fields(settings_type) if field.init})
             return make(**settings)
         except (ConfigError, TypeError) as error:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited

@@ -18,6 +18,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
+from rlftsim.policies import SHIPPED_POLICIES
 from rlftsim.policies.checkpoint import find_model as find_model
 from rlftsim.policies.checkpoint import find_similar_model, read_model
 from rlftsim.rollout.policy import LoadablePolicy, Policy
@@ -25,16 +26,7 @@ from rlftsim.rollout.policy import LoadablePolicy, Policy
 POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
     "policy",
     "rlftsim.policies",
-    {
-        "smart": "rlftsim.policies.smart.policy:SmartPolicy",
-        "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
-        "calibrated": "rlftsim.policies.calibrated.policy:CalibratedPolicy",
-        "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
-        "demo-base": "rlftsim.policies.shipped:demo_base",
-        "demo-tuned": "rlftsim.policies.shipped:demo_tuned",
-        "demo-goals": "rlftsim.policies.shipped:demo_goals",
-        "trafficbots-base": "rlftsim.policies.shipped:trafficbots_base",
-    },
+    SHIPPED_POLICIES,
     use=lambda name: load_policy(name) if _needs_no_arguments(POLICIES.get(name)) else _loadable(name),
 )
 """Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""

@@ -48,7 +48,7 @@ def select_polylines(features: MapFeatures, types: tuple[int, ...]) -> Polylines
         features: Features of the map, all points in a single array.
         types: `MapFeatureType` values of the polylines, such as road edges or lanes.
     """
-    feature = features.indices_of(types)
+    feature = features.find_indices(types)
     feature = feature[np.diff(features.offsets)[feature] >= 2]
     count = np.diff(features.offsets)[feature]
     first = np.cumsum(count) - count

@@ -549,9 +549,9 @@ def _back_propagate(subject: _Subject, *, scale: float) -> dict[str, nn.Paramete
 
 def freezing_weights_changes_no_score(subject: _Subject) -> str:
     """Freezing the weights changes no score."""
-    frozen, free = (subject.copy_module(is_trained) for is_trained in (False, True))
-    frozen_score = subject.log_prob(subject.batch, subject.rollouts, frozen)
-    return _check_gap(frozen_score, subject.log_prob(subject.batch, subject.rollouts, free), SCORE_TOLERANCE)
+    policies = [subject.copy_module(is_trained) for is_trained in (False, True)]
+    frozen, trained = (subject.log_prob(subject.batch, subject.rollouts, policy) for policy in policies)
+    return _check_gap(frozen, trained, SCORE_TOLERANCE)
 
 
 def shared_passes_change_no_number(subject: _Subject) -> str:

@@ -47,7 +47,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, require_types
+from rlftsim.errors import ConfigError, check_types
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -64,7 +64,7 @@ class Sampling:
     """Keep only this many of the most likely decisions; None keeps all."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if not 0 <= self.temperature < math.inf:
             raise ConfigError(
                 f"sampling temperature must be >= 0 and finite, got {self.temperature}: 1 samples, 0 takes the mode."

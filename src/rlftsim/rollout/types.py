@@ -14,7 +14,7 @@ from torch import Tensor
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals, shown_id
-from rlftsim.scenario.batch import Frame, origin_of
+from rlftsim.scenario.batch import Frame, compute_origin
 from rlftsim.scenario.types import Scenario, render_html
 
 
@@ -190,7 +190,7 @@ class Rollouts:
             )
         agent = int(np.flatnonzero(ids == object_id)[0])
         # Added in float64, as `ScenarioBatch.to_world` does, so that only the result is rounded.
-        origin = torch.from_numpy(origin_of(scenario, self.provenance.frame)).to(self.position.device)
+        origin = torch.from_numpy(compute_origin(scenario, self.provenance.frame)).to(self.position.device)
         position = (self.position[row, :, agent].double() + origin).float()  # [N, T, 2]
         return torch.cat([position, self.heading[row, :, agent, :, None].float()], -1)
 

@@ -8,7 +8,7 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset
-from rlftsim.scenario.shards import refuse_unsound
+from rlftsim.scenario.shards import check_shard
 from rlftsim.scenario.types import Scenario, Scenarios
 
 Name: TypeAlias = str | os.PathLike[str]
@@ -17,7 +17,7 @@ AnyScenarios: TypeAlias = Scenario | ScenarioBatch | Scenarios | Name
 training to train, validation else, as on the command line."""
 
 
-def scenarios_of(scenarios: Any, split: str | None = "validation") -> Scenarios:
+def to_scenarios(scenarios: Any, split: str | None = "validation") -> Scenarios:
     """Scenarios by position, in whatever form they were handed over.
 
     Args:
@@ -43,7 +43,7 @@ def scenarios_of(scenarios: Any, split: str | None = "validation") -> Scenarios:
     for one in items:
         if not isinstance(one, Scenario):
             raise ConfigError(f"{type(scenarios).__name__} with {in_short(one)}: not scenarios: {wanted}")
-        refuse_unsound(one)
+        check_shard(one)
     if not len(found):
         raise ConfigError("no scenario: hand over at least one.")
     return found

@@ -117,7 +117,7 @@ class Av2Source:
 
     def detects(self, path: str | os.PathLike[str]) -> bool:
         """True where at least one scenario has its map beside it."""
-        return any(_map_of(file).exists() for file in find_files(path))
+        return any(_parse_map(file).exists() for file in find_files(path))
 
     def find(self, path: str | os.PathLike[str]) -> list[Unit]:
         """One unit for the scenarios of a folder whose ids begin with the same two characters.
@@ -130,11 +130,11 @@ class Av2Source:
         groups = defaultdict(list)
         for file in files:
             split = file.absolute().parent.parent.name
-            groups[(split, _id_of(file)[:2])].append(file)
+            groups[(split, _read_id(file)[:2])].append(file)
         return [
             Unit(
                 f"{split}/{start}" if split in SPLITS else start,
-                tuple(part for file in group for part in (file, _map_of(file)) if part.exists()),
+                tuple(part for file in group for part in (file, _parse_map(file)) if part.exists()),
                 SPLITS.get(split, "unknown"),
             )
             for (split, start), group in sorted(groups.items())
@@ -153,9 +153,9 @@ class Av2Source:
                             "tracks to predict not evaluated, as they leave the ground that the map covers", num_cut
                         )
             except DataError as error:
-                yield SkippedRecord(_id_of(file), record, str(error))
+                yield SkippedRecord(_read_id(file), record, str(error))
                 record += 1
-            yield BytesRead(sum(part.stat().st_size for part in (file, _map_of(file)) if part.exists()))
+            yield BytesRead(sum(part.stat().st_size for part in (file, _parse_map(file)) if part.exists()))
 
     def describe(self) -> dict[str, object]:
         """Guessed sizes, what is missing, and the settings."""
@@ -179,7 +179,7 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
         for file in (place.rglob("scenario_*.parquet") if place.is_dir() else [place])
         if file.name.startswith("scenario_") and file.suffix == ".parquet"
     }
-    return sorted(found, key=lambda file: (_id_of(file), str(file)))
+    return sorted(found, key=lambda file: (_read_id(file), str(file)))
 
 
 def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int]]:
@@ -197,9 +197,9 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
     """
     columns = _read_columns(file)
     num_steps = _count_steps(file, columns)
-    if not _map_of(file).exists():
-        raise DataError(f"{file.name}: there is no {_map_of(file).name} beside it")
-    map_features, ground = read_map(_map_of(file))
+    if not _parse_map(file).exists():
+        raise DataError(f"{file.name}: there is no {_parse_map(file).name} beside it")
+    map_features, ground = read_map(_parse_map(file))
     windows = WINDOWS[source.window] if num_steps == RECORDED_STEPS else TEST_WINDOW
     whole, category, ego = _read_tracks(file, columns, num_steps, source, ground)
     for first, end in windows:
@@ -376,12 +376,12 @@ def _object_ids(file: Path, names: np.ndarray) -> np.ndarray:
     return ids
 
 
-def _id_of(file: Path) -> str:
+def _read_id(file: Path) -> str:
     return file.stem.removeprefix("scenario_")
 
 
-def _map_of(file: Path) -> Path:
-    return file.with_name(f"log_map_archive_{_id_of(file)}.json")
+def _parse_map(file: Path) -> Path:
+    return file.with_name(f"log_map_archive_{_read_id(file)}.json")
 
 
 def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:

@@ -101,12 +101,12 @@ def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, fra
         raise DataError(f"{fullest.scenario_id}: {max(counts)} agents do not fit max_agents={num_agents}: raise it.")
     # as long as the longest log; the 80 future steps of a test split are invalid
     num_steps = max(s.num_steps for s in scenarios)
-    rows = [_agent_rows(s, num_agents, num_steps, origin_of(s, frame)) for s in scenarios]
+    rows = [_agent_rows(s, num_agents, num_steps, compute_origin(s, frame)) for s in scenarios]
     stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
     return ScenarioBatch(scenarios=tuple(scenarios), **stacked, frame=frame)
 
 
-def origin_of(scenario: Scenario, frame: Frame) -> Float[np.ndarray, "2"]:
+def compute_origin(scenario: Scenario, frame: Frame) -> Float[np.ndarray, "2"]:
     """World coordinates of a frame's (0, 0), float64, meters.
 
     Args:

@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Int64, Shaped
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError, require_types, whole_number
+from rlftsim.errors import ConfigError, DataError, check_types, whole_number
 from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, validate_folder
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import cannot_write, write_atomically, write_text
@@ -481,7 +481,7 @@ def parse_manifest(folder: Path) -> Manifest:
         shards = tuple(shard_entry_from_json(shard) for shard in values.pop("shards"))
         duplicates = tuple(_skipped_from_json(duplicate) for duplicate in values.pop("duplicates"))
         manifest = Manifest(shards=shards, duplicates=duplicates, **values)
-        require_types(manifest)
+        check_types(manifest)
         _check_numbers("counts", manifest.counts)
         if not isinstance(manifest.provenance, Mapping):
             raise TypeError("provenance is no object")
@@ -511,7 +511,7 @@ def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
     """
     skipped = tuple(_skipped_from_json(record) for record in values["skipped"])
     entry = ShardEntry(**{**values, "skipped": skipped})
-    require_types(entry)
+    check_types(entry)
     _check_numbers("tallies", entry.tallies)
     path = PurePosixPath(entry.file)
     if path.is_absolute() or ".." in path.parts or not entry.file.isprintable():
@@ -521,7 +521,7 @@ def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
 
 def _skipped_from_json(values: Mapping[str, Any]) -> SkippedRecord:
     record = SkippedRecord(**values)
-    require_types(record)
+    check_types(record)
     return record
 
 

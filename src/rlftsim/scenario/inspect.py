@@ -183,17 +183,17 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
     """Doubtful content of one scenario, at most one finding of each kind."""
     where, tracks, lights = scenario.scenario_id, scenario.tracks, scenario.lights
     try:
-        scenario.refuse_broken()
+        scenario.check_consistency()
     except DataError as error:
         # The other checks rely on these.
         yield Finding(Problem.BROKEN, where, str(error))
         return
     try:
-        scenario.refuse_not_finite()
+        scenario.check_finite_arrays()
     except DataError as error:
         yield Finding(Problem.NOT_FINITE, where, str(error))
     try:
-        scenario.refuse_coarse()
+        scenario.check_precision()
     except DataError as error:
         yield Finding(Problem.FAR_FROM_ORIGIN, where, str(error))
 
@@ -223,7 +223,7 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
 
     features = scenario.map_features
     kinds = (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
-    missing = [name for name, types in kinds if not len(features.indices_of(types))]
+    missing = [name for name, types in kinds if not len(features.find_indices(types))]
     if missing:
         detail = f"no {' and no '.join(missing)}" if len(features.points) else "no map features"
         yield Finding(Problem.MISSING_MAP, where, detail)

@@ -58,7 +58,7 @@ def lane_graph(scenario: Scenario) -> LaneGraph:
     features = scenario.map_features
     limits = features.topology.speed_limit_mph
     kept, lines, headings = [], [], []
-    for index in features.indices_of(LANE_TYPES):
+    for index in features.find_indices(LANE_TYPES):
         line = features.polyline(index).astype(np.float64)
         line = line[np.isfinite(line).all(1)]
         if len(line) >= 2:

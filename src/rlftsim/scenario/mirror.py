@@ -35,7 +35,7 @@ def mirrored(scenario: Scenario) -> Scenario:
 def _mirrored_map(features: MapFeatures) -> MapFeatures:
     # The road lies to the left of its edges, and of their mirror images to the right: they run the other way.
     order = np.arange(len(features.points))
-    for index in features.indices_of(ROAD_EDGE_TYPES):
+    for index in features.find_indices(ROAD_EDGE_TYPES):
         own = slice(features.offsets[index], features.offsets[index + 1])
         order[own] = order[own][::-1]
 

@@ -5,12 +5,12 @@ import os
 from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import SYNTHETIC, ScenarioDataset, dataset_folder
 
-__all__ = ["CACHED_SCENARIOS", "SYNTHETIC", "dataset_folder", "open_dataset", "refuse_unknown", "splits_of"]
+__all__ = ["CACHED_SCENARIOS", "SYNTHETIC", "check_splits", "dataset_folder", "list_splits", "open_dataset"]
 CACHED_SCENARIOS = 1024
 """About a megabyte each; their tokens stay in memory with them."""
 
 
-def splits_of(name: str | os.PathLike[str]) -> list[str]:
+def list_splits(name: str | os.PathLike[str]) -> list[str]:
     """Splits in which a data set has scenarios."""
     return sorted(set(ScenarioDataset(name).index["split"].to_pylist()))
 
@@ -30,12 +30,12 @@ def open_dataset(
     """
     scenarios = ScenarioDataset(name, split, cache_size=cache_size)
     if split is not None and not len(scenarios):
-        known = ", ".join(splits_of(name)) or "none at all"
+        known = ", ".join(list_splits(name)) or "none at all"
         raise DataError(f"{name} has no scenarios in split {split!r}: it has {known}.")
     return scenarios
 
 
-def refuse_unknown(scenarios: ScenarioDataset, scenario_id: str, name: str, place: object) -> None:
+def check_splits(scenarios: ScenarioDataset, scenario_id: str, name: str, place: object) -> None:
     """Refuse a scenario id that a data set, or its split, does not have.
 
     Args:

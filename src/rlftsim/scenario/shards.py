@@ -108,14 +108,14 @@ class ShardWriter:
         """Append a scenario.
 
         Args:
-            scenario: a sound one, see `refuse_unsound`.
+            scenario: a sound one, see `check_shard`.
             split: name of its split.
             source_record: number of its record in the file it was converted from; None if there is none.
 
         Raises:
             DataError: the scenario is unsound, or the file cannot be written (a full disk, say).
         """
-        refuse_unsound(scenario)
+        check_shard(scenario)
         # every array by itself: each gets the encoding that suits its values
         encoded = {name: None if array is None else encode_array(array) for name, array in _to_arrays(scenario).items()}
         row = {
@@ -214,7 +214,7 @@ class ShardReader:
             plain = {name: self._table[name][row].as_py() for name in names}
             scenario = _from_arrays(plain, arrays)
             # the checksum is of the arrays alone
-            scenario.refuse_bad_id()
+            scenario.check_scenario_id()
             num_tracks = len(scenario.tracks.object_id)
             if not 0 <= scenario.ego_index < num_tracks:
                 raise ValueError(f"its ego is track {scenario.ego_index} of {num_tracks}")
@@ -233,24 +233,24 @@ _RUN_AGAIN = "run the conversion or generation that made it again"
 _WAY_OUT = f"delete the file and {_RUN_AGAIN}"
 
 
-def refuse_unsound(scenario: Scenario) -> None:
+def check_shard(scenario: Scenario) -> None:
     """Check that a scenario is what `types.py` declares, so that it can be stored, simulated and scored.
 
     Raises:
-        DataError: its id is no file name, an array has another dtype or other axes, a valid state or map point is not
-            finite, a position is too far out for float32, or what `Scenario.refuse_broken` finds; names the scenario
+        DataError: The id is no file name, an array has another dtype or other axes, a valid state or map point is not
+            finite, a position is too far out for float32, or `Scenario.check_consistency` refuses; names the scenario
             and the value.
     """
-    scenario.refuse_bad_id()
+    scenario.check_scenario_id()
     try:
-        scenario.refuse_misshapen()
+        scenario.check_array_shapes()
         for name, array in _to_arrays(scenario).items():
             kind = getattr(array, "dtype", type(array).__name__)
             if array is not None and kind != _ARRAY_DTYPES[name]:
                 raise DataError(f"{name} is {kind}, it must be {_ARRAY_DTYPES[name]}")
-        scenario.refuse_broken()
-        scenario.refuse_not_finite()
-        scenario.refuse_coarse()
+        scenario.check_consistency()
+        scenario.check_finite_arrays()
+        scenario.check_precision()
     except DataError as error:
         raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
 

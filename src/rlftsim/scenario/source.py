@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 from rlftsim.errors import BadRecordError, DataError
 from rlftsim.scenario.consistency import describe_contradictions
-from rlftsim.scenario.shards import refuse_unsound
+from rlftsim.scenario.shards import check_shard
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
 
@@ -122,7 +122,7 @@ def read_unit(
                 continue
             if isinstance(item, Scenario):
                 try:
-                    refuse_unsound(item)
+                    check_shard(item)
                 except DataError as error:
                     item = SkippedRecord(unit.name, record, str(error))
             if isinstance(item, Scenario):

@@ -69,7 +69,7 @@ def _detecting(names: Iterable[str], path: str | os.PathLike[str]) -> list[str]:
     return [name for name in names if getattr(_source(name), "detects", lambda _: False)(path)]
 
 
-def attribution_of(source: str) -> str:
+def find_attribution(source: str) -> str:
     """Line that pictures of a data source's scenarios carry; empty for most, and for those of other packages."""
     return getattr(SOURCES.find(source), "attribution", "") if source in _SHIPPED else ""
 

@@ -210,11 +210,11 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
             f"counter-clockwise from +x, and step_s in {SCENARIOS} the seconds between two steps"
         )
     if "predict" in row and row["predict"][0] is not None:
-        predicted = _indices_of(row, "predict", tracks)
+        predicted = _find_indices(row, "predict", tracks)
     else:
         predicted = _choose_predicted(tracks, ego)
         guessed.add("predict")
-    interest = _indices_of(row, "interest", tracks) if "interest" in row and row["interest"][0] is not None else []
+    interest = _find_indices(row, "interest", tracks) if "interest" in row and row["interest"][0] is not None else []
     lights = _read_lights(parts.get(LIGHTS), first_step, step_s, tracks.valid.shape[1], map_features)
     return Scenario(
         scenario_id=str(row["scenario_id"][0]),
@@ -253,7 +253,7 @@ def _read_tracks(rows: _Rows, first_step: int, step_s: float, ground: MapFeature
     if len(again):
         raise rows.error(again[0] + 1, f"object {rows['object_id'][again[0]]} has a second row for step "
                          f"{rows['step'][again[0]]}")  # fmt: skip
-    kind = _numbers_of(rows, "type", ObjectType)
+    kind = _read_numbers(rows, "type", ObjectType)
     other = np.flatnonzero(same & (kind[1:] != kind[:-1]))
     if len(other):
         raise rows.error(other[0] + 1, f"object {rows['object_id'][other[0]]} has a second type")
@@ -350,7 +350,7 @@ def _choose_predicted(tracks: Tracks, ego: int) -> list[int]:
     return sorted(nearest.tolist())
 
 
-def _indices_of(row: _Rows, name: str, tracks: Tracks) -> list[int]:
+def _find_indices(row: _Rows, name: str, tracks: Tracks) -> list[int]:
     """Track indices of a list of object ids."""
     index = {int(object_id): k for k, object_id in enumerate(tracks.object_id)}
     for object_id in row[name][0]:
@@ -364,7 +364,7 @@ def _indices_of(row: _Rows, name: str, tracks: Tracks) -> list[int]:
 
 def _read_map(rows: _Rows, lanes: _Rows | None) -> MapFeatures:
     """Map features in the order of their first rows."""
-    kind = _numbers_of(rows, "type", MapFeatureType)
+    kind = _read_numbers(rows, "type", MapFeatureType)
     _refuse_impossible_numbers(rows)
     points = np.column_stack([rows["x"], rows["y"], rows["z"] if "z" in rows else np.zeros(len(rows))])
     ids, first, owner = np.unique(rows["feature_id"], return_index=True, return_inverse=True)
@@ -424,12 +424,12 @@ def _refuse_edges_that_run_backwards(rows: _Rows, features: MapFeatures) -> None
     Raises:
         DataError: one has the nearest lanes on its right along most of its length.
     """
-    lanes = [densify(features.polyline(k)[:, :2].astype(np.float64), 1.0) for k in features.indices_of(LANE_TYPES)]
+    lanes = [densify(features.polyline(k)[:, :2].astype(np.float64), 1.0) for k in features.find_indices(LANE_TYPES)]
     if not lanes:
         return
     lane_points = np.concatenate(lanes)
     tree = KDTree(lane_points)
-    for index in features.indices_of(ROAD_EDGE_TYPES):
+    for index in features.find_indices(ROAD_EDGE_TYPES):
         edge = densify(features.polyline(index)[:, :2].astype(np.float64), 1.0)
         middle, along = (edge[1:] + edge[:-1]) / 2, np.diff(edge, axis=0)
         distance, nearest = tree.query(middle)
@@ -453,9 +453,9 @@ def _read_lights(
     if rows is not None:
         _refuse_impossible_numbers(rows)
         _check_repeated(rows, "lane_id", "step")
-        state = _numbers_of(rows, "state", LightState)
+        state = _read_numbers(rows, "state", LightState)
         seconds = (rows["step"] - first_step) * step_s
-        place = {int(features.feature_id[k]): k for k in features.indices_of(LANE_TYPES)}
+        place = {int(features.feature_id[k]): k for k in features.find_indices(LANE_TYPES)}
         for lane in np.unique(rows["lane_id"]):
             own = np.flatnonzero(rows["lane_id"] == lane)
             own = own[np.argsort(seconds[own], kind="stable")]
@@ -496,7 +496,7 @@ def _check_repeated(rows: _Rows, *names: str) -> None:
         raise rows.error(again[0], f"a second row with {cells}: every row needs its own")
 
 
-def _numbers_of(rows: _Rows, name: str, kinds: type[IntEnum]) -> Int64[np.ndarray, "n"]:
+def _read_numbers(rows: _Rows, name: str, kinds: type[IntEnum]) -> Int64[np.ndarray, "n"]:
     """Numbers of a column of numbers or names."""
     known: dict[Any, int] = {kind.name.lower(): int(kind) for kind in kinds} | {int(kind): int(kind) for kind in kinds}
     values, inverse = np.unique(rows[name], return_inverse=True)

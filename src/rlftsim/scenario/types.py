@@ -186,7 +186,7 @@ class MapFeatures:
         own = slice(self.offsets[index], self.offsets[index + 1])
         return polygon if self.polygon_rest is None else polygon + self.polygon_rest[own]
 
-    def indices_of(self, types: tuple[int, ...]) -> Int64[np.ndarray, "n"]:
+    def find_indices(self, types: tuple[int, ...]) -> Int64[np.ndarray, "n"]:
         """Indices of the features of the given types, in file order."""
         return np.flatnonzero(np.isin(self.feature_type, types))
 
@@ -226,7 +226,7 @@ class Scenario:
     guessed: frozenset[str] = frozenset()
     """Values that the log lacks and the data source made up, such as "size" and "z"."""
 
-    def refuse_bad_id(self) -> None:
+    def check_scenario_id(self) -> None:
         """Check that the id can be a file name: films and rollouts are named after their scenario.
 
         Raises:
@@ -240,7 +240,7 @@ class Scenario:
                 f"most {MAX_ID_BYTES} bytes without slashes and control characters"
             )
 
-    def refuse_misshapen(self) -> None:
+    def check_array_shapes(self) -> None:
         """Check that tracks, map and lights hold arrays with the axes that their classes declare.
 
         Raises:
@@ -249,9 +249,9 @@ class Scenario:
         features = self.map_features
         parts = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
         for place, part in parts.items():
-            _refuse_misshapen(part, place)
+            _check_shapes(part, place)
 
-    def refuse_broken(self) -> None:
+    def check_consistency(self) -> None:
         """Check what every reader relies on: steps of 0.1 s, track indices, ids that differ, types, states, sizes, map.
 
         Sizes are those at the current step: simulation and metric read no others, and logs hold zeros where a state is
@@ -272,9 +272,9 @@ class Scenario:
         _check_unique("object id {} belongs to {} tracks: give each its own", tracks.object_id)
         _check_unique("map feature id {} belongs to {} features: give each its own", lines.feature_id)
         _check_unique("tracks_to_predict names track index {} {} times: name it once", self.tracks_to_predict)
-        _refuse_unknown("track", tracks.object_id, "type", tracks.object_type, ObjectType)
-        _refuse_unknown("map feature", lines.feature_id, "type", lines.feature_type, MapFeatureType)
-        _refuse_unknown("light of lane", lights.lane_id, "state", lights.state, LightState)
+        _check_types("track", tracks.object_id, "type", tracks.object_type, ObjectType)
+        _check_types("map feature", lines.feature_id, "type", lines.feature_type, MapFeatureType)
+        _check_types("light of lane", lights.lane_id, "state", lights.state, LightState)
         cuts = lines.offsets
         if len(cuts) != len(lines) + 1 or cuts[0] != 0 or cuts[-1] != len(lines.points) or (np.diff(cuts) < 0).any():
             raise DataError(
@@ -291,7 +291,7 @@ class Scenario:
                 f"({CURRENT_STEP}), it must be above zero"
             )
 
-    def refuse_not_finite(self) -> None:
+    def check_finite_arrays(self) -> None:
         """Check every valid state and every map point.
 
         Raises:
@@ -322,7 +322,7 @@ class Scenario:
                 "correct it or leave the feature out"
             )
 
-    def refuse_coarse(self) -> None:
+    def check_precision(self) -> None:
         """Check that float32 resolves every position to a centimeter, as it does up to 131 km from the origin.
 
         Raises:
@@ -418,7 +418,7 @@ def render_html(value: Any) -> str | None:
     return None if render is None else render(value)
 
 
-def _refuse_misshapen(part: Any, place: str) -> None:
+def _check_shapes(part: Any, place: str) -> None:
     sizes: dict[str, int] = {}
     for one in fields(part):
         value, is_optional = getattr(part, one.name), type(None) in get_args(one.type)
@@ -459,7 +459,7 @@ def _check_unique(complaint: str, ids: Int[np.ndarray, "n"]) -> None:
         raise DataError(complaint.format(values[count.argmax()], count.max()))
 
 
-def _refuse_unknown(
+def _check_types(
     thing: str, ids: Int64[np.ndarray, "n"], field_name: str, codes: Int8[np.ndarray, "n"], kinds: type[IntEnum]
 ) -> None:
     wrong = np.flatnonzero(~np.isin(codes, list(kinds)))
@@ -481,7 +481,7 @@ class Scenarios(Protocol):
         ...
 
 
-def scenario_ids_of(scenarios: Scenarios) -> Iterable[str]:
+def list_scenario_ids(scenarios: Scenarios) -> Iterable[str]:
     """Scenario ids in order."""
     # a data set has them in its index: its scenarios need not be read
     known = getattr(scenarios, "scenario_ids", None)

@@ -190,8 +190,8 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         objects_of_interest=np.array(message.objects_of_interest, np.int64),
         source="womd",
     )
-    scenario.refuse_broken()
-    scenario.refuse_not_finite()
+    scenario.check_consistency()
+    scenario.check_finite_arrays()
     return scenario
 
 
@@ -252,7 +252,7 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     # a kind that womd.proto does not have yet reads as a feature without data
     features = [feature for feature in features if feature.WhichOneof("feature_data")]
     kinds = [feature.WhichOneof("feature_data") for feature in features]
-    typed_points = [_points_of(feature, kind) for feature, kind in zip(features, kinds)]
+    typed_points = [_parse_points(feature, kind) for feature, kind in zip(features, kinds)]
     flat = [value for _, points in typed_points for p in points for value in (p.x, p.y, p.z)]
     offsets = np.zeros(len(features) + 1, np.int64)
     np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
@@ -273,7 +273,7 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     )
 
 
-def _points_of(feature: womd_pb2.MapFeature, kind: str) -> tuple[int, Sequence[womd_pb2.MapPoint]]:
+def _parse_points(feature: womd_pb2.MapFeature, kind: str) -> tuple[int, Sequence[womd_pb2.MapPoint]]:
     """Type of a map feature (numbers of `MapFeatureType`) and its points."""
     match kind:
         case "lane":

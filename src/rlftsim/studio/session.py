@@ -22,7 +22,7 @@ from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
-from rlftsim.scenario.open import open_dataset, splits_of
+from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.studio.imported import Imported, import_rollouts
 from rlftsim.studio.refusal import Refusal
@@ -127,7 +127,7 @@ class Session:
         rollouts: tuple[str, ...] = (),
     ) -> None:
         self.data = data
-        self.splits = splits_of(data)
+        self.splits = list_splits(data)
         self.split = split or ("validation" if "validation" in self.splits else self.splits[0])
         self._datasets = {name: open_dataset(data, name) for name in dict.fromkeys((self.split, *self.splits))}
         check_folder(out, "results")

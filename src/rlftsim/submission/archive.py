@@ -102,7 +102,7 @@ def join_shards(archive: Path, folder: Path, pieces: Sequence[PackedShard], *, d
         else:
             out.write(_GZIP_HEADER)
         for piece in pieces[num_joined:]:
-            _refuse_damaged(folder / piece.file, piece)
+            _check_archive(folder / piece.file, piece)
             with (folder / piece.file).open("rb") as file:
                 shutil.copyfileobj(file, out, _CHUNK)
             if delete:
@@ -145,7 +145,7 @@ def _partial(archive: Path) -> Path:
     return archive.with_name(f".{archive.name}.partial")
 
 
-def _refuse_damaged(path: Path, piece: PackedShard) -> None:
+def _check_archive(path: Path, piece: PackedShard) -> None:
     """Compare a piece with its receipt before any of it is in the archive; a damaged one is removed."""
     crc = size = 0
     if path.exists():

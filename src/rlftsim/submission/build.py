@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, DataError, require_types
+from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.jobs.documents import read_json
@@ -70,7 +70,7 @@ class Job:
         """A finished shard; None if there is none. Its file may be in the archive already."""
         try:
             shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
-            require_types(shard)
+            check_types(shard)
         except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
         return shard if shard.file == self.shard_path(number).name else None

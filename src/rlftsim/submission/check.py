@@ -20,7 +20,7 @@ from rlftsim.jobs.progress import progress_bar
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import GzipReader
-from rlftsim.submission.entry import problems_of
+from rlftsim.submission.entry import find_problems
 from rlftsim.submission.findings import MAX_KEPT, Finding, Findings
 from rlftsim.submission.messages import DecodedRollouts, decode_rollouts
 from rlftsim.submission.scenario_checks import check_rollouts
@@ -179,7 +179,7 @@ class _Pass:
             metadata = SimAgentsChallengeSubmission.FromString(data)
         except DecodeError as error:
             raise DataError(f"{file}: no submission message ({error})") from None
-        problems = problems_of(metadata)
+        problems = find_problems(metadata)
         if not problems and self.found.metadata is not None and metadata != self.found.metadata:
             names = [
                 one.name

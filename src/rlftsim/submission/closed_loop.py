@@ -37,7 +37,7 @@ The code makes sure of the first and the last three points. That the policy itse
 for you to know."""
 
 
-def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
+def check_closed_loop(policy: Policy, scenario: Scenario) -> None:
     """Refuse a policy that cannot make the statement.
 
     Args:

@@ -134,7 +134,7 @@ def describe_entry(entry: Entry, num_parameters: str) -> bytes:
     return message.SerializeToString(deterministic=True)
 
 
-def problems_of(message: SimAgentsChallengeSubmission) -> list[str]:
+def find_problems(message: SimAgentsChallengeSubmission) -> list[str]:
     """Required fields that a shard lacks, or has with values that the server refuses."""
     problems = [f"{name} is missing" for name in REQUIRED_FIELDS if not message.HasField(name)]
     if message.HasField("submission_type") and message.submission_type != message.SIM_AGENTS_SUBMISSION:

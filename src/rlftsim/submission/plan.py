@@ -111,7 +111,7 @@ def make_plan(
     return Plan(shards, tuple(int(agents[shard.start : shard.stop].sum()) for shard in shards), identity)
 
 
-def refuse_other_sources(data: ScenarioDataset) -> None:
+def check_sources(data: ScenarioDataset) -> None:
     """Refuse recordings that are not Waymo's, the only ones the leaderboard knows; synthetic scenarios are practice.
 
     Raises:
@@ -125,7 +125,7 @@ def refuse_other_sources(data: ScenarioDataset) -> None:
         )
 
 
-def refuse_incomplete(data: ScenarioDataset) -> None:
+def check_complete(data: ScenarioDataset) -> None:
     """Refuse a split that lacks files, before anything is simulated: the server wants every scenario of it.
 
     Raises:

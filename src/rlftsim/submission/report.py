@@ -166,7 +166,7 @@ def reported_sha256(archive: Path) -> str | None:
         return None
 
 
-def findings_of(check: ArchiveCheck) -> tuple[tuple[Finding, ...], dict[int, int]]:
+def select_findings(check: ArchiveCheck) -> tuple[tuple[Finding, ...], dict[int, int]]:
     """The findings of a check as a report has them, and how many there are of each number."""
     return tuple(check.findings.kept), dict(sorted(check.findings.counts.items()))
 
@@ -178,7 +178,7 @@ def write_findings(check: ArchiveCheck, path: Path) -> None:
         check: of any archive.
         path: of the file.
     """
-    findings, counts = findings_of(check)
+    findings, counts = select_findings(check)
     values = {
         "archive": check.archive,
         "bytes": check.size,

@@ -10,11 +10,11 @@ from jaxtyping import Float32
 from rlftsim.errors import (
     ConfigError,
     DataError,
+    check_finiteness,
+    check_not_negative,
+    check_positive,
+    check_types,
     given,
-    require_finite,
-    require_not_negative,
-    require_positive,
-    require_types,
 )
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.scenario.types import STEP_S, Scenarios
@@ -65,14 +65,14 @@ class TokensConfig:
     seed: int = 2
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if self.num_tokens < 2 or self.num_map_prototypes < 1:
             raise ConfigError(f"a vocabulary needs num_tokens >= 2 and num_map_prototypes >= 1, got {self}.")
         if not 0 < self.coverage <= 1:
             raise ConfigError(f"coverage is a fraction in (0, 1], got {self.coverage}.")
-        require_positive(self, ("max_segments", *given(self, ("max_scenarios",))))
-        require_not_negative(self, ("straight_up_to_mps", "seed"))
-        require_finite(self, ("straight_up_to_mps",))
+        check_positive(self, ("max_segments", *given(self, ("max_scenarios",))))
+        check_not_negative(self, ("straight_up_to_mps", "seed"))
+        check_finiteness(self, ("straight_up_to_mps",))
 
 
 def build_vocabulary(

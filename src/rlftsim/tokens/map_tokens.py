@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from rlftsim.geometry import rotate
-from rlftsim.scenario.batch import ScenarioBatch, origin_of
+from rlftsim.scenario.batch import ScenarioBatch, compute_origin
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatureType, Scenario
 
@@ -89,7 +89,7 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> M
         return pad_sequence([torch.from_numpy(array).to(dtype) for array in arrays], batch_first=True).to(batch.device)
 
     # The origin is subtracted before the result is rounded to float32.
-    origins = [origin_of(scenario, batch.frame) for scenario in batch.scenarios]
+    origins = [compute_origin(scenario, batch.frame) for scenario in batch.scenarios]
     local_points = [(segments.points - origin).astype(np.float32) for segments, origin in zip(maps, origins)]
     points = pad(local_points, torch.float32)
     heading = pad([segments.heading for segments in maps], torch.float32)
@@ -115,7 +115,7 @@ def split_map(scenario: Scenario) -> MapSegments:
     features = scenario.map_features
     # 1. Polylines by family (lanes, road edges, road lines, polygons), each family in file order.
     families = ((0, 1, 2, 3), (14, 15, 16), tuple(range(5, 14)), (18, 19, 20))
-    order = [(int(i), family) for family, types in enumerate(families) for i in features.indices_of(types)]
+    order = [(int(i), family) for family, types in enumerate(families) for i in features.find_indices(types)]
     stop_lanes = set(features.topology.stop_sign_lanes[:, 1].tolist())
     # 2. Light of each lane at the current step; of a lane that is listed twice, the last one.
     is_current = scenario.lights.step == CURRENT_STEP

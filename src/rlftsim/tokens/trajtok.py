@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from rlftsim.errors import ConfigError, require_finite, require_not_negative, require_positive
+from rlftsim.errors import ConfigError, check_finiteness, check_not_negative, check_positive
 from rlftsim.tokens.motions import mirror_poses
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
@@ -32,8 +32,8 @@ class Grid:
     """A cell with fewer is empty."""
 
     def __post_init__(self) -> None:
-        require_positive(self, ("min_motions",))
-        require_finite(self, ("x_min_m", "x_max_m", "y_max_m"))
+        check_positive(self, ("min_motions",))
+        check_finiteness(self, ("x_min_m", "x_max_m", "y_max_m"))
         if not (self.x_min_m < 0 < self.x_max_m and self.y_max_m > 0 and self.x_bins > 1 and self.y_bins > 1):
             raise ConfigError(f"a grid needs x_min_m < 0 < x_max_m, y_max_m > 0 and at least 2 bins, got {self}.")
         zero = -self.x_min_m / self.spacing_m[0]
@@ -71,7 +71,7 @@ class TrajTokConfig:
     def __post_init__(self) -> None:
         if self.neighborhood < 3 or not self.neighborhood % 2:
             raise ConfigError(f"neighborhood must be odd and at least 3, got {self.neighborhood}.")
-        require_not_negative(self, ("num_neighbors",))
+        check_not_negative(self, ("num_neighbors",))
 
     @property
     def grids(self) -> tuple[Grid, Grid, Grid]:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from rlftsim.errors import CheckpointError, require_positive, require_types
+from rlftsim.errors import CheckpointError, check_positive, check_types
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class AlarmConfig:
     """Change, either way, of the mean speed against that of the log at the same steps."""
 
     def __post_init__(self) -> None:
-        require_types(self)
-        require_positive(
+        check_types(self)
+        check_positive(
             self,
             ("first_updates", "window", "min_ade_rise", "diversity_fall", "red_light_rise", "speed_drift_mps"),
         )

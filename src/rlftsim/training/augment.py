@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, given, require_positive, require_types
+from rlftsim.errors import ConfigError, check_positive, check_types, given
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import write_goal_file
 from rlftsim.goals.types import Points
@@ -66,8 +66,8 @@ class AugmentConfig:
     """Of the rollouts."""
 
     def __post_init__(self) -> None:
-        require_types(self)
-        require_positive(self, ("num_rollouts", "scenarios_per_part", *given(self, ("top_k",))))
+        check_types(self)
+        check_positive(self, ("num_rollouts", "scenarios_per_part", *given(self, ("top_k",))))
         metric_by_name(self.metric)
 
 

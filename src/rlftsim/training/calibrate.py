@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, require_positive, require_types
+from rlftsim.errors import ConfigError, check_positive, check_types
 from rlftsim.jobs.progress import log
 from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -99,8 +99,8 @@ class CalibrateConfig:
     device: DeviceConfig = field(default_factory=DeviceConfig)
 
     def __post_init__(self) -> None:
-        require_types(self)
-        require_positive(
+        check_types(self)
+        check_positive(
             self, ("kl", "max_kl", "clip", "num_scenarios", "batch_size", "micro_batch_size", "checkpoint_every")
         )
         if self.num_rollouts < 2:

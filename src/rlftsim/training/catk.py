@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, given, require_positive
+from rlftsim.errors import ConfigError, check_positive, given
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.batch import ScenarioBatch
@@ -63,7 +63,7 @@ class CatkConfig(ImitationConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, ("num_candidates", *given(self, ("max_distance_lengths",))))
+        check_positive(self, ("num_candidates", *given(self, ("max_distance_lengths",))))
         if not 0 <= self.goal_probability <= 1:
             raise ConfigError(f"goal_probability is a probability in [0, 1], got {self.goal_probability}.")
 

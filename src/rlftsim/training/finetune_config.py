@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rlftsim.errors import ConfigError, require_finite, require_not_negative, require_positive, require_types
+from rlftsim.errors import ConfigError, check_finiteness, check_not_negative, check_positive, check_types
 from rlftsim.realism import metric_by_name
 from rlftsim.rewards import CreditTo, parse_reward, write_reward
 from rlftsim.rewards.goal import goal_terms
@@ -77,15 +77,15 @@ class FinetuneConfig:
     device: DeviceConfig = field(default_factory=DeviceConfig)
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if self.num_rollouts < 2:
             raise ConfigError(
                 f"MLOO needs at least 2 rollouts per scenario, got {self.num_rollouts}: set finetune.num_rollouts >= 2."
             )
         sizes = ("batch_size", "micro_batch_size", "rollouts_per_pass", "checkpoint_every", "max_skipped_in_a_row")
-        require_positive(self, ("epochs", "learning_rate", "gradient_clip", "max_kl", *sizes))
-        require_not_negative(self, ("warmup_updates", "weight_decay", "imitation_weight"))
-        require_finite(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus", "imitation_weight"))
+        check_positive(self, ("epochs", "learning_rate", "gradient_clip", "max_kl", *sizes))
+        check_not_negative(self, ("warmup_updates", "weight_decay", "imitation_weight"))
+        check_finiteness(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus", "imitation_weight"))
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"betas are decay rates in [0, 1), got {self.betas}.")
         if not 0 <= self.credit_mixing <= 1:

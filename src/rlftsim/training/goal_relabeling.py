@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, require_positive
+from rlftsim.errors import ConfigError, check_positive
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
@@ -50,7 +50,7 @@ class GcslConfig(ImitationConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, ("num_rollouts",))
+        check_positive(self, ("num_rollouts",))
         if self.validation.every:
             raise ConfigError(f"gcsl.validation has no effect: {NOT_VALIDATED}")
         if self.goal_learning_rate_scale != 1.0:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, DataError, require_finite, require_not_negative, require_positive, require_types
+from rlftsim.errors import ConfigError, DataError, check_finiteness, check_not_negative, check_positive, check_types
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import StoredGoals
 from rlftsim.goals.types import Goals
@@ -11,7 +11,7 @@ from rlftsim.jobs.progress import log
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, is_goal_conditioned
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import Scenarios, scenario_ids_of
+from rlftsim.scenario.types import Scenarios, list_scenario_ids
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class GoalConfig:
     """Learning rate of the goal encoder, whose weights begin at zero, over that of all other weights."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         for name in ("probability", "augmented_probability"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"goals.{name} is a probability in [0, 1], got {getattr(self, name)}.")
-        require_finite(self, ("hindsight", "learning_rate_scale"))
-        require_not_negative(self, ("hindsight",))
-        require_positive(self, ("learning_rate_scale",))
+        check_finiteness(self, ("hindsight", "learning_rate_scale"))
+        check_not_negative(self, ("hindsight",))
+        check_positive(self, ("learning_rate_scale",))
         if not self.probability and (self.augmented or self.hindsight):
             raise ConfigError(
                 "goals.augmented and goals.hindsight need goals: set goals.probability above 0, such as 1."
@@ -53,7 +53,7 @@ class GoalConfig:
             return None
         # The folder may hold goals of a larger data set, so only these scenarios are counted.
         stored = StoredGoals(Path(self.augmented))
-        count = stored.count_among(scenario_ids_of(scenarios))
+        count = stored.count_among(list_scenario_ids(scenarios))
         if not count:
             raise DataError(
                 f"{self.augmented}: its goals are of other scenarios: "

@@ -20,7 +20,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive, require_types
+from rlftsim.errors import ConfigError, check_finiteness, check_not_negative, check_positive, check_types, given
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import ImitationLoss, Prediction
 from rlftsim.scenario.batch import ScenarioBatch
@@ -102,12 +102,12 @@ class ImitationConfig:
     device: DeviceConfig = field(default_factory=DeviceConfig)
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         sizes = ("batch_size", "micro_batch_size", "max_skipped_in_a_row", "checkpoint_every")
         rates = ("learning_rate", "goal_learning_rate_scale", "gradient_clip", "trained_radius_m")
-        require_positive(self, ("epochs", *sizes, *rates, *given(self, ("micro_batch_cost", "context_radius_m"))))
-        require_not_negative(self, ("warmup_updates", "weight_decay", *given(self, ("max_trained_agents",))))
-        require_finite(self, ("epochs", "learning_rate", "weight_decay"))
+        check_positive(self, ("epochs", *sizes, *rates, *given(self, ("micro_batch_cost", "context_radius_m"))))
+        check_not_negative(self, ("warmup_updates", "weight_decay", *given(self, ("max_trained_agents",))))
+        check_finiteness(self, ("epochs", "learning_rate", "weight_decay"))
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"betas are decay rates in [0, 1), got {self.betas}.")
         if not 0 <= self.final_lr_ratio <= 1:

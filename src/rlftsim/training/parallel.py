@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol, cast, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, require_not_negative, require_positive, require_types
+from rlftsim.errors import ConfigError, check_not_negative, check_positive, check_types
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.training.batches import balance_by_cost
 
@@ -88,9 +88,9 @@ class DeviceConfig:
     Rollouts always use one."""
 
     def __post_init__(self) -> None:
-        require_types(self)
-        require_positive(self, ("num_nodes", *(() if self.processes == "auto" else ("processes",))))
-        require_not_negative(self, ("threads",))
+        check_types(self)
+        check_positive(self, ("num_nodes", *(() if self.processes == "auto" else ("processes",))))
+        check_not_negative(self, ("threads",))
 
     @property
     def uses_cuda(self) -> bool:

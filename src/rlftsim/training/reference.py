@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from rlftsim.errors import ConfigError, require_positive, require_types
+from rlftsim.errors import ConfigError, check_positive, check_types
 from rlftsim.training.alarms import Alarms
 from rlftsim.training.goals import StoredGoals
 from rlftsim.training.run import Learner
@@ -36,8 +36,8 @@ class KlConfig:
     """Alpha: weight of the policy in a sync, reference = alpha * policy + (1 - alpha) * reference."""
 
     def __post_init__(self) -> None:
-        require_types(self)
-        require_positive(self, ("target", "horizon"))
+        check_types(self)
+        check_positive(self, ("target", "horizon"))
         if not 0 <= self.reference_ema <= 1 or self.reference_sync_every < 0:
             raise ConfigError(f"need 0 <= kl.reference_ema <= 1 and kl.reference_sync_every >= 0, got {self}.")
         if not 0 < self.min_beta <= self.initial_beta <= self.max_beta:

@@ -29,7 +29,7 @@ from rlftsim.jobs.files import append_text, errors_name, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.types import Scenarios, scenario_ids_of
+from rlftsim.scenario.types import Scenarios, list_scenario_ids
 from rlftsim.training.checkpoint import newest_checkpoint
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
     """
     ids = hashlib.blake2b(digest_size=16)
     # Not the scenarios themselves: reading every one would take minutes.
-    for scenario_id in scenario_ids_of(scenarios):
+    for scenario_id in list_scenario_ids(scenarios):
         ids.update(f"{scenario_id}\n".encode())
     files = {SCENARIO_FILES: scenarios.fingerprint} if isinstance(scenarios, ScenarioDataset) else {}
     return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest(), **files}

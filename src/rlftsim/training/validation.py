@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from rlftsim.errors import ConfigError, given, require_not_negative, require_positive, require_types
+from rlftsim.errors import ConfigError, check_not_negative, check_positive, check_types, given
 from rlftsim.realism import metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.policy import Policy, Sampling
@@ -53,11 +53,11 @@ class ValidationConfig:
     """Of the choice and of the rollouts, the same at every validation."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if self.every < 0:
             raise ConfigError(f"validation.every must be 0 (never) or more updates, got {self.every}.")
-        require_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass", *given(self, ("top_k",))))
-        require_not_negative(self, ("seed",))
+        check_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass", *given(self, ("top_k",))))
+        check_not_negative(self, ("seed",))
         metric_by_name(self.metric)
 
     def is_due(self, update: int, total: int) -> bool:

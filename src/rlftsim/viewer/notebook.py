@@ -14,7 +14,7 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.files import write_text
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, register_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
@@ -114,7 +114,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
         raise ConfigError(f"{len(titles)} titles for {len(rollouts)} rollouts: give one each, or none.")
     numbered = [f"rollouts {i + 1}" for i in range(len(rollouts))] if len(rollouts) > 1 else ["rollouts"]
     names = [*titles, *numbered[len(titles) :]]
-    scenarios = scenarios_of(scenario)
+    scenarios = to_scenarios(scenario)
     # One figure a scenario: the log, then one panel for each argument of rollouts.
     figures = []
     for row in range(min(len(scenarios), MAX_SCENARIOS)):

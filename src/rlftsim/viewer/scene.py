@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.sources import attribution_of
+from rlftsim.scenario.sources import find_attribution
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
@@ -349,7 +349,7 @@ def _build_lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tu
 def _note(scenario: Scenario) -> str:
     """Attribution of the source, and the facts of the scenario that are guessed."""
     guessed = f"Guessed, not logged: {', '.join(sorted(scenario.guessed))}." if scenario.guessed else ""
-    return f"{attribution_of(scenario.source)} {guessed}".strip()
+    return f"{find_attribution(scenario.source)} {guessed}".strip()
 
 
 def _focus(scenario: Scenario) -> tuple[float, float, float]:

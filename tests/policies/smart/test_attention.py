@@ -156,7 +156,7 @@ def draw_queries(sources_are_shared):
 @pytest.mark.parametrize("dropout", [0.0, 0.3])
 @pytest.mark.parametrize("sources_are_shared", [True, False])
 def test_layers_that_share_edges_have_the_gradients_of_plain_attention(sources_are_shared, dropout, blocks):
-    around = Neighborhoods(torch.arange(7), blocks[0], EdgeGradients.of(list(blocks[0])))
+    around = Neighborhoods(torch.arange(7), blocks[0], EdgeGradients.from_blocks(blocks[0]))
     source = None if sources_are_shared else blocks[2]
     queries = draw_queries(sources_are_shared)
     trained = [*blocks[1], *queries, *([] if source is None else [source])]
@@ -184,7 +184,7 @@ def test_gradients_of_gathered_edges_are_those_of_finite_differences(sources_are
 
     def gather(edges, other_edges, *tensors):
         renewed = tuple(replace(b, edge_features=e) for b, e in zip(blocks[0], (edges, other_edges)))
-        around = Neighborhoods(torch.arange(7), renewed, EdgeGradients.of(list(renewed)))
+        around = Neighborhoods(torch.arange(7), renewed, EdgeGradients.from_blocks(renewed))
         queries, own = (tensors, None) if source is None else (tensors[:-1], tensors[-1])
         sums, weight = gather_edges(queries, own, around, 0.3)
         return *sums, weight
@@ -196,7 +196,7 @@ def test_gradients_of_gathered_edges_are_those_of_finite_differences(sources_are
 def test_edge_features_go_with_the_backward_pass(blocks):
     edges = blocks[1][0] * 1  # not a leaf: nothing but the graph needs it later
     first = replace(blocks[0][0], edge_features=edges)
-    around = Neighborhoods(torch.arange(4), (first,), EdgeGradients.of([first]))
+    around = Neighborhoods(torch.arange(4), (first,), EdgeGradients.from_blocks([first]))
     memory = weakref.ref(edges.untyped_storage())
     sums, _ = gather_edges(tuple(q[:4] for q in draw_queries(True)), None, around, 0.0)
     loss = sums[0].sum()

@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError
 from rlftsim.policies.smart.catk_checkpoint import export_catk, import_catk, write_catk
-from rlftsim.policies.smart.catk_keys import PREFIX, aliases
-from rlftsim.policies.smart.catk_vocabulary import is_published, read_catk_vocabulary, write_catk_vocabulary
+from rlftsim.policies.smart.catk_keys import PREFIX, find_aliases
+from rlftsim.policies.smart.catk_vocabulary import has_published_tokens, read_catk_vocabulary, write_catk_vocabulary
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.tokens.vocabulary import Vocabulary
@@ -320,7 +320,7 @@ def test_a_lightning_file_and_safetensors_give_the_same_model(golden, token_tabl
     other = import_catk(golden.folder / "nano_seed1003.safetensors", token_tables)
     assert same(other.policy, nano)
     assert other.policy.config == nano.config == replace(smart_nano(), catk_compat=True)
-    assert is_published(nano.vocabulary)
+    assert has_published_tokens(nano.vocabulary)
 
 
 @pytest.mark.official
@@ -337,10 +337,10 @@ def test_keys_and_shapes_of_every_size_are_the_public_ones(preset, golden):
     shapes = json.loads((golden.folder / "state_dict_shapes.json").read_text())[preset.__name__.removeprefix("smart_")]
     ours = export_catk(fresh(preset(), num_tokens=2048))
     assert {k.removeprefix(PREFIX): list(v.shape) for k, v in ours.items()} == shapes
-    assert len(aliases(ours)) == 2 * (preset().num_map_layers + 2 * preset().num_decoder_layers)
+    assert len(find_aliases(ours)) == 2 * (preset().num_map_layers + 2 * preset().num_decoder_layers)
 
 
 @pytest.mark.official
 def test_another_vocabulary_is_not_taken_for_the_published_one(token_tables, nano):
-    assert not is_published(replace(nano.vocabulary, corners=nano.vocabulary.corners + 1e-6))
+    assert not has_published_tokens(replace(nano.vocabulary, corners=nano.vocabulary.corners + 1e-6))
     assert read_catk_vocabulary(token_tables).num_tokens == 2048

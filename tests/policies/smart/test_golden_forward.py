@@ -144,7 +144,7 @@ def test_motion_embedding(nano, golden, batch_a):
     arrays = golden.arrays("nano/centred_layers")
     decoder, batch = nano.network.decoder, batch_a("centred")
     with torch.no_grad():
-        of_agents = nano._scene(batch).agent_features[0]
+        of_agents = nano._build_scene(batch).agent_features[0]
         for value, expected in zip(arrays["embed/x_a/in"], arrays["embed/x_a/out"]):
             # the file does not say whose row it is
             ours = decoder.motion(torch.from_numpy(value).expand(NUM_AGENTS, 2), of_agents)
@@ -196,7 +196,7 @@ def check_all_edges(done: Pass, expected: dict[str, np.ndarray], poses, map_posi
 
 def check_edges_of(policy, done: Pass, batch, expected) -> None:
     tokens = policy._tokenize(batch)
-    scene = policy._scene(batch)
+    scene = policy._build_scene(batch)
     positions = tokens.position[0].numpy(), scene.map_position[0].numpy()
     check_all_edges(done, expected, *positions, policy.config.agent_map_radius_m)
 

@@ -110,7 +110,7 @@ def scores():
 
 def scored(scores, hidden, last, class_id, ends):
     """Scores [R, V] of tokens with these ends; the last one led to `last`."""
-    before = scores.keys(last.expand(3, -1, -1)).phase_before[class_id.clamp(max=2), torch.arange(len(last))]
+    before = scores.keys(last.expand(3, -1, -1)).last_phase[class_id.clamp(max=2), torch.arange(len(last))]
     return scores.queries(hidden, before, class_id) @ scores.keys(ends).keys.mT
 
 

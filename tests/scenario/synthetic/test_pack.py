@@ -31,7 +31,7 @@ def pack() -> ScenarioDataset:
 def signed_distance_to_edges(points: np.ndarray, scenario: Scenario) -> np.ndarray:
     """Distance of points [n, 2] to the nearest road edge, negative to its left."""
     features = scenario.map_features
-    edges = [features.polyline(k)[:, :2].astype(float) for k in features.indices_of(ROAD_EDGE_TYPES)]
+    edges = [features.polyline(k)[:, :2].astype(float) for k in features.find_indices(ROAD_EDGE_TYPES)]
     start, end = np.concatenate([e[:-1] for e in edges]), np.concatenate([e[1:] for e in edges])
     along = end - start
     share = ((points[:, None] - start) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-9)

@@ -41,7 +41,7 @@ def crosses_forbidden_line(scenario: Scenario, points: Float[np.ndarray, "S 3"])
 def _segments(scenario: Scenario) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Both ends of every segment of a forbidden line."""
     features = scenario.map_features
-    lines = [features.polyline(i)[:, :2].astype(np.float64) for i in features.indices_of(FORBIDDEN)]
+    lines = [features.polyline(i)[:, :2].astype(np.float64) for i in features.find_indices(FORBIDDEN)]
     start = np.concatenate([np.zeros((0, 2)), *(line[:-1] for line in lines)])
     end = np.concatenate([np.zeros((0, 2)), *(line[1:] for line in lines)])
     is_joined = np.linalg.norm(end - start, axis=1) <= GAP_M

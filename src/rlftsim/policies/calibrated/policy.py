@@ -22,6 +22,7 @@ from rlftsim.policies.calibrated.table import calibration_table, read_calibratio
 from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
+from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import TokenPolicy
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -246,8 +247,6 @@ class CalibratedPolicy(nn.Module):
             ConfigError: There is no such folder, or a feature is not registered here.
             CheckpointError: A file is missing, damaged or does not fit.
         """
-        from rlftsim.policies.registry import load_policy  # which knows this class
-
         stored = read_model(folder, architecture=cls.architecture)
         eta = stored.read_weights().get("eta")
         if eta is None or not eta.isfinite().all():

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import heading_vector, wrap_angle
-from rlftsim.scenario.batch import Frame, ScenarioBatch, origin_of
+from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, Scenario
@@ -87,8 +87,8 @@ def cut_pieces(scenario: Scenario, types: tuple[int, ...], frame: Frame) -> Piec
         frame: Frame of the pieces.
     """
     features, starts, deltas = scenario.map_features, [], []
-    for index in features.indices_of(types):
-        line = features.polyline(index)[:, :2].astype(np.float64) - origin_of(scenario, frame)
+    for index in features.find_indices(types):
+        line = features.polyline(index)[:, :2].astype(np.float64) - compute_origin(scenario, frame)
         length = arc_length(line)[-1] if len(line) > 1 else 0.0
         if length > 0:
             # a little less, so that rounding of a length of whole pieces does not cut it in another way

@@ -24,7 +24,7 @@ from rlftsim.policies.smart.embeddings import EPSILON, RelationEmbedding, normal
 from rlftsim.policies.smart.neighbors import RowGroups
 
 FLOATS_PER_BLOCK = {"cpu": 1 << 19}
-"""Floats of the relations that are processed together: on a processor they fit its cache."""
+"""Floats of the relations that are processed together: on a processor they fit the cache."""
 FLOATS_PER_BLOCK_ELSEWHERE = 1 << 26
 MOST_ROWS_PER_BLOCK = 65535
 """Largest grid of the fused attention on CUDA (pytorch#142228)."""
@@ -58,21 +58,21 @@ class NeighborBlock:
 class Neighborhoods:
     """The neighbors of all rows, shared by all layers.
 
-    Rows are sorted by their number of neighbors, so little is padded. Off the CPU, in closed loop, they are not: all
-    rows are there in their order, padded to the same width.
+    Rows are sorted by the number of neighbors, so little is padded. Off the CPU, in closed loop, all rows are there in
+    the given order, padded to the same width.
     """
 
     rows: Int64[Tensor, "n"] | None
-    """The rows that have neighbors, block after block; None = all rows in their order."""
+    """The rows that have neighbors, block after block; None = all rows in order."""
     blocks: tuple[NeighborBlock, ...]
     gradients: "EdgeGradients | None"
     """Sums of the layers' gradients of the edge features; None where these are constants."""
-    has_any: Bool[Tensor, "R"] | None = None
+    has_neighbor: Bool[Tensor, "R"] | None = None
     """True = the row has a neighbor, where all rows are there."""
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the edge features."""
+        """Type of the edge features."""
         return self.blocks[0].edge_features.dtype
 
     @property
@@ -83,14 +83,14 @@ class Neighborhoods:
 
 @dataclass(frozen=True, eq=False)
 class GoalEdges:
-    """For each goal-conditioned row one more source, at any distance: the map token nearest to its goal."""
+    """A further source for each goal-conditioned row, at any distance: the map token nearest to the goal."""
 
     rows: Int64[Tensor, "g"]
     """The goal-conditioned rows, each once."""
     relation: Float[Tensor, "g D"]
-    """Normalized embedding of the relation, as of any other source."""
+    """Normalized embedding of the relation, as for ordinary sources."""
     goal_relation: Float[Tensor, "g D"]
-    """The same with the goal embedding added."""
+    """`relation` with the goal embedding added."""
     features: Float[Tensor, "g D"]
     """Normalized features of the source."""
 
@@ -109,59 +109,59 @@ def build_neighborhoods(
     """Embed relations and cut the lists into blocks.
 
     Args:
-        embedding: of the n values of a relation.
-        values: of each row's relation to each neighbor.
-        neighbors: rows of the sources; any valid row where the mask is False.
-        mask: True = a neighbor.
-        dim: D.
-        padded: keep all rows, their order and their width, so that blocks depend on shapes alone.
-        features: normalized features of the sources, if they are the same in all layers.
-        groups: rows that share a list; None = each of the R lists is that of a row.
+        embedding: Embedding of the n values of a relation, computed once for all layers.
+        values: Values of each row's relation to each neighbor, such as distance and bearing, meters and radians.
+        neighbors: Row of the sources of each neighbor; any valid row where the mask is False.
+        mask: True = the entry is a neighbor, False = padding.
+        dim: Width D of all features, which decides how many relations a block has.
+        padded: Whether all rows keep order and width, so that blocks depend on shapes alone.
+        features: Normalized features of the sources, if all layers read the same; None = each layer hands in others.
+        groups: Rows that share each of the R lists; None = a list per row.
     """
     pairs = FLOATS_PER_BLOCK.get(mask.device.type, FLOATS_PER_BLOCK_ELSEWHERE) // dim
     if padded:
         size = min(max(pairs // mask.shape[1], 1), MOST_ROWS_PER_BLOCK)
-        rows, has_any = None, mask.any(-1)
-        parts = [(slice(start, start + size), slice(None), 1) for start in range(0, len(mask), size)]
+        rows, has_neighbor = None, mask.any(-1)
+        cuts = [(slice(start, start + size), slice(None), 1) for start in range(0, len(mask), size)]
     else:
-        rows, parts = _sort(mask, pairs, groups)
-        has_any = None
+        rows, cuts = _sort(mask, pairs, groups)
+        has_neighbor = None
     blocks = []
-    for lists, kept, num_sharing in parts:
-        index = neighbors[lists, kept]  # [r, K]
-        edge_features = _embed_edges(embedding, values[lists, kept], index, features)
-        bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~mask[lists, kept], IMPOSSIBLE)
+    for lists, columns, num_sharing in cuts:
+        index = neighbors[lists, columns]  # [r, K]
+        edge_features = _embed_edges(embedding, values[lists, columns], index, features)
+        bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~mask[lists, columns], IMPOSSIBLE)
         blocks.append(NeighborBlock(index, bias[:, None], edge_features, num_sharing))
     is_trained = any(block.edge_features.requires_grad for block in blocks)
-    return Neighborhoods(rows, tuple(blocks), EdgeGradients.of(blocks) if is_trained else None, has_any)
+    return Neighborhoods(rows, tuple(blocks), EdgeGradients.from_blocks(blocks) if is_trained else None, has_neighbor)
 
 
 def _sort(
     mask: Bool[Tensor, "R K"], pairs: int, groups: RowGroups | None
 ) -> tuple[Int64[Tensor, "n"], list[tuple[Int64[Tensor, "_"], slice, int]]]:
-    """Rows that have neighbors, block after block, and each block's lists, their width and the rows of each.
+    """Rows that have neighbors, block after block, and each block's lists, columns and number of rows per list.
 
-    A group whose size is no power of two is taken apart into parts that are.
+    A group whose size is no power of two is divided into groups of such sizes.
     """
-    # 1. a list's width is the place of its last neighbor; lists without any are left out
+    # 1. a list is as wide as the column of its last neighbor; lists without a neighbor are left out
     columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
     widths = (mask * columns).amax(-1).cpu().numpy()
     sizes = np.ones_like(widths) if groups is None else groups.sizes
-    # 2. blocks of lists with as many rows, from the narrowest to the widest; in a group the smaller parts come first
+    # 2. blocks of lists with as many rows, from the narrowest to the widest; of a divided group the smaller come first
     # torch's order of equal widths: dropout masks are drawn block after block, so a stored run goes on with its own
     order = torch.from_numpy(widths).sort().indices.numpy()
     lists, rows, shapes = [], [], []
     for count in (1 << power for power in range(int(sizes.max(initial=1)).bit_length())):
-        found = order[(sizes[order] & count > 0) & (widths[order] > 0)]
-        starts = (sizes.cumsum() - sizes + (sizes & (count - 1)))[found]
-        lists.append(found)
+        selected = order[(sizes[order] & count > 0) & (widths[order] > 0)]
+        starts = (sizes.cumsum() - sizes + (sizes & (count - 1)))[selected]
+        lists.append(selected)
         rows.append((starts[:, None] + np.arange(count)).flatten())
-        cuts = _cut(widths[found], pairs) if len(found) or count == 1 else []
-        shapes += [(cut.stop - cut.start, slice(int(widths[found[cut]].max(initial=1))), count) for cut in cuts]
+        cuts = _cut(widths[selected], pairs) if len(selected) or count == 1 else []
+        shapes += [(cut.stop - cut.start, slice(int(widths[selected[cut]].max(initial=1))), count) for cut in cuts]
     sorted_lists = torch.from_numpy(np.concatenate(lists)).to(mask.device)
     blocks = sorted_lists.split([num_lists for num_lists, _, _ in shapes])
-    parts = [(block, width, count) for block, (_, width, count) in zip(blocks, shapes)]
-    return sorted_lists if groups is None else groups.rows[np.concatenate(rows)], parts
+    blocks = [(block, columns, count) for block, (_, columns, count) in zip(blocks, shapes)]
+    return sorted_lists if groups is None else groups.rows[np.concatenate(rows)], blocks
 
 
 def _embed_edges(
@@ -176,7 +176,7 @@ def _embed_edges(
     """
     is_constant = embedding.is_frozen and (features is None or not features.requires_grad)
     if is_constant or not torch.is_grad_enabled():
-        return _embed_edges_in_place(embedding, values, neighbors, features)
+        return _embed_constant_edges(embedding, values, neighbors, features)
 
     def embed() -> Float[Tensor, "r K D"]:
         return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
@@ -186,13 +186,13 @@ def _embed_edges(
     return relation if features is None else torch.cat([relation, functional.embedding(neighbors, features)], -1)
 
 
-def _embed_edges_in_place(
+def _embed_constant_edges(
     embedding: RelationEmbedding,
     values: Float[Tensor, "r K n"],
     neighbors: Int64[Tensor, "r K"],
     features: Float[Tensor, "S D"] | None,
 ) -> Float[Tensor, "r K W"]:
-    """The same without gradient and copies."""
+    """Edge features of a block, without gradient and copies."""
     last: nn.Linear = embedding.out[-1]  # type: ignore[assignment]
     hidden = embedding.out[:-1](embedding.embed_inputs(values.flatten(0, 1))).to(last.weight.dtype)  # [rK, D]
     dim = last.out_features
@@ -210,10 +210,7 @@ def _embed_edges_in_place(
 
 
 def _cut(widths: np.ndarray, pairs: int) -> list[slice]:
-    """Slices of rows of increasing width, of about so many pairs and of similar width.
-
-    At least one slice, maybe empty.
-    """
+    """Slices, at least one, of rows of increasing width: of about so many pairs, and of similar width."""
     if not len(widths):
         return [slice(0, 0)]
     step = max(math.ceil(widths[-1] / WIDTHS), LEAST_WIDTH_STEP)
@@ -224,27 +221,27 @@ def _cut(widths: np.ndarray, pairs: int) -> list[slice]:
 
 @dataclass(frozen=True, eq=False)
 class EdgeGradients:
-    """Gradients of all blocks' edge features, which the layers that attend along them add up in one buffer a block.
+    """Gradients of all blocks' edge features, which the attending layers add up in a single buffer per block.
 
-    Autograd would make a tensor of that size in each layer and sum them. Instead each layer depends on a token and
-    adds to the buffers in its backward pass. The token's node comes after all of them and hands the buffers on.
+    Autograd would make a tensor of that size in each layer and sum these. Instead each layer depends on a token and
+    adds to the buffers in the backward pass. The token's node comes after all layers and hands the buffers on.
     """
 
     buffers: list[Float[Tensor, "_ _ W"] | None]
-    """None = nothing was added."""
+    """None = no layer has added a gradient."""
     token: Float[Tensor, ""]
     """A number without a meaning that depends on the edge features."""
 
     @classmethod
-    def of(cls, blocks: list[NeighborBlock]) -> "EdgeGradients":
-        """No gradients yet, of these blocks' edge features."""
+    def from_blocks(cls, blocks: Sequence[NeighborBlock]) -> "EdgeGradients":
+        """Empty gradients of the edge features of blocks."""
         buffers: list[Tensor | None] = [None] * len(blocks)
         token = _HandOver.apply(buffers, *(block.edge_features for block in blocks))
         return cls(buffers, token)  # type: ignore[arg-type]
 
 
 class _HandOver(Function):
-    """A token that depends on tensors; its backward pass hands the gradients on that are in the buffers by then."""
+    """A token that depends on tensors; the backward pass hands the gradients on that are in the buffers by then."""
 
     @staticmethod
     def forward(ctx: Any, buffers: list[Tensor | None], *tensors: Tensor) -> Tensor:
@@ -265,13 +262,13 @@ def gather_edges(
     neighborhoods: Neighborhoods,
     dropout: float,
 ) -> tuple[tuple[Float[Tensor, "n H _"], ...], Float[Tensor, "n H 1"]]:
-    """Attention-weighted sums of edge features, those of sources if there are any, and sums of the weights.
+    """Attention-weighted sums of edge features, and of sources if there are any, and sums of the weights.
 
     Args:
-        queries: in the space of edge features [n, H, W], and in that of sources [n, H, D].
-        source: features of all sources; None = they are in the edge features.
-        neighborhoods: of the n rows.
-        dropout: probability that a weight is zeroed.
+        queries: Queries in the space of edge features [n, H, W], and in the space of sources [n, H, D].
+        source: Features of all sources; None = the edge features include the features of the neighbors.
+        neighborhoods: Neighbors of the n rows, whose edge features are keys and values alike.
+        dropout: Chance in [0, 1) that a weight is zeroed, as in training.
     """
     if torch.is_grad_enabled() or dropout:
         token = None if neighborhoods.gradients is None else neighborhoods.gradients.token
@@ -283,10 +280,9 @@ def gather_edges(
     # the fused kernel is faster, although relations and sources are copied together for it
     results = []
     for block_query, block in zip(torch.cat(queries, -1).split(neighborhoods.sizes), neighborhoods.blocks):
-        parts = _parts(block.edge_features, block.neighbors, source)
-        edges = (parts[0] if source is None else torch.cat(parts, -1))[:, None]  # [r, 1, K, 2D]
-        bias = block.bias[:, None]
+        edges = torch.cat(_key_spaces(block.edge_features, block.neighbors, source), -1)[:, None]  # [r, 1, K, 2D]
         query = _by_list(block_query, block.num_sharing * block_query.shape[1])[:, None]  # [r, 1, m H, 2D]
+        bias = block.bias[:, None]
         result = functional.scaled_dot_product_attention(query, edges, edges, attn_mask=bias, scale=1.0)
         results.append(result.view(block_query.shape))
     gathered = torch.cat(results)  # [n, H, 2D]
@@ -294,11 +290,11 @@ def gather_edges(
 
 
 class _GatherEdges(Function):
-    """`gather_edges` with a backward pass of its own.
+    """`gather_edges` with a hand-written backward pass.
 
     With edge features E, queries q and scores s = q E^T: the weights are A = dropout(P), P = softmax(s), and the sums
     G = A E. Backward dA = dG E^T + d(sum of A), ds = A dA - P sum(A dA), dq = ds E and dE = A^T dG + ds^T q, which is
-    one product of factors that lie side by side. Of each block P and A are stored.
+    a single product of factors that lie side by side. P and A of each block are stored.
     """
 
     @staticmethod
@@ -313,18 +309,18 @@ class _GatherEdges(Function):
         sums = [query.new_empty(query.shape) for query in queries]
         total = queries[0].new_empty(*queries[0].shape[:2], 1)
         saved, sizes = [], neighborhoods.sizes
-        per_block = zip(neighborhoods.blocks, _cut_all(queries, sizes), _cut_all(sums, sizes), total.split(sizes))
+        per_block = zip(neighborhoods.blocks, _split_rows(queries, sizes), _split_rows(sums, sizes), total.split(sizes))
         for block, block_queries, block_sums, block_total in per_block:
             edges = block.edge_features.detach()
-            parts = _parts(edges, block.neighbors, source)
+            spaces = _key_spaces(edges, block.neighbors, source)
             num_heads = block.num_sharing * total.shape[1]
             scores = block.bias.expand(-1, num_heads, -1)
-            for part, query in zip(parts, block_queries):
-                scores = torch.baddbmm(scores, _by_list(query, num_heads), part.mT)  # [r, m H, K]
+            for space, query in zip(spaces, block_queries):
+                scores = torch.baddbmm(scores, _by_list(query, num_heads), space.mT)  # [r, m H, K]
             softmax = torch.softmax(scores, -1)
             weights = softmax * draw_dropout(softmax, dropout) if dropout else softmax
-            for part, result in zip(parts, block_sums):
-                torch.bmm(weights, part, out=_by_list(result, num_heads))
+            for space, result in zip(spaces, block_sums):
+                torch.bmm(weights, space, out=_by_list(result, num_heads))
             torch.sum(weights, -1, keepdim=True, out=_by_list(block_total, num_heads))
             saved.append((edges, block.neighbors, softmax, weights))
         # saved in this way, edge features go as soon as the backward pass is through
@@ -342,45 +338,45 @@ class _GatherEdges(Function):
         _, _, edges_need_grad, source_needs_grad, *_ = ctx.needs_input_grad
         source_grad = torch.zeros_like(source) if source_needs_grad else None
         query_grads = [query.new_empty(query.shape) for query in queries]
-        rows_of_blocks = (_cut_all(rows, ctx.sizes) for rows in (sum_grads, queries, query_grads))
+        rows_of_blocks = (_split_rows(rows, ctx.sizes) for rows in (sum_grads, queries, query_grads))
         per_block = zip(zip(*[iter(saved)] * 4), *rows_of_blocks, total_grad.split(ctx.sizes))
         # As in the forward pass: a backward pass may be called under autocast.
         with torch.autocast(ctx.device_type, enabled=False):
             for index, (stored, block_sums, block_queries, block_grads, block_total) in enumerate(per_block):
                 edges, neighbors, softmax, weights = stored
-                parts, num_heads = _parts(edges, neighbors, source), weights.shape[1]
+                spaces, num_heads = _key_spaces(edges, neighbors, source), weights.shape[1]
                 # factors of gradients of the edges [r, 2 m H, W] and of the sources [r, 2 m H, D]
                 pairs = ([_by_list(rows, num_heads) for rows in pair] for pair in zip(block_sums, block_queries))
                 factors = [torch.cat(pair, 1) for pair in pairs]
                 weight_grad = _by_list(block_total, num_heads).expand_as(weights)
-                for part, factor in zip(parts, factors):
-                    weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, m H, K]
+                for space, factor in zip(spaces, factors):
+                    weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], space.mT)  # [r, m H, K]
                 score_grad = weight_grad.mul_(weights)
                 score_grad = torch.addcmul(score_grad, softmax, score_grad.sum(-1, keepdim=True), value=-1)
-                for part, result in zip(parts, block_grads):
-                    torch.bmm(score_grad, part, out=_by_list(result, num_heads))
-                left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2 m H]
+                for space, result in zip(spaces, block_grads):
+                    torch.bmm(score_grad, space, out=_by_list(result, num_heads))
+                by_key = torch.cat([weights, score_grad], 1).mT  # [r, K, 2 m H]
                 if edges_need_grad:
                     buffer = ctx.buffers[index]
-                    added = torch.bmm(left, factors[0]) if buffer is None else buffer.baddbmm_(left, factors[0])
-                    ctx.buffers[index] = added
+                    updated = torch.bmm(by_key, factors[0]) if buffer is None else buffer.baddbmm_(by_key, factors[0])
+                    ctx.buffers[index] = updated
                 if source_grad is not None:
-                    source_grad.index_add_(0, neighbors.flatten(), (left @ factors[1]).flatten(0, 1))
+                    source_grad.index_add_(0, neighbors.flatten(), (by_key @ factors[1]).flatten(0, 1))
         token_grad = total_grad.new_zeros(()) if edges_need_grad else None
         return None, None, token_grad, source_grad, *query_grads
 
 
-def _parts(edges: Tensor, neighbors: Tensor, source: Tensor | None) -> tuple[Tensor, ...]:
-    """Edge features, and the neighbors' features if these are not among them."""
+def _key_spaces(edges: Tensor, neighbors: Tensor, source: Tensor | None) -> tuple[Tensor, ...]:
+    """Edge features, and the neighbors' features if the edge features do not include these."""
     return (edges,) if source is None else (edges, functional.embedding(neighbors, source))
 
 
 def _by_list(rows: Tensor, num_heads: int) -> Tensor:
-    """Rows of a block [r m, H, _] as those of its lists [r, m H, _], which have m H heads; a view if it can be."""
+    """Rows of a block [r m, H, _] as rows of the block's lists [r, m H, _], with m H heads; a view where possible."""
     return rows.reshape(-1, num_heads, rows.shape[-1])
 
 
-def _cut_all(tensors: Sequence[Tensor], sizes: list[int]) -> Iterator[tuple[Tensor, ...]]:
+def _split_rows(tensors: Sequence[Tensor], sizes: list[int]) -> Iterator[tuple[Tensor, ...]]:
     """The rows of each block, of all tensors."""
     return zip(*(tensor.split(sizes) for tensor in tensors))
 
@@ -393,15 +389,15 @@ class AttentionMaps:
     """Divided by sqrt(d)."""
     to_value: Float[Tensor, "H W d"]
     constant: Float[Tensor, "H d"]
-    """The part of a value that is the same for every neighbor: maps of the norms' biases, and the maps' own."""
+    """Term of a value that is the same for every neighbor: maps of the norms' biases, and biases of the maps."""
 
 
 class RelationAttention(nn.Module):
-    """Attention of rows to their neighbors along relations, with a gate and a feed-forward part.
+    """Attention of rows to neighbors along relations, with a gate and a feed-forward network.
 
-    Keys and values are linear in the neighbor's features and in the relation. So queries are projected into their
-    spaces, and values are aggregated there before they are projected. That is the same function as projecting every
-    edge, with less work and no tensor of size edges x H x d. Norm weights are folded into the projections. Terms
+    Keys and values are linear in the neighbor's features and in the relation. So queries are projected into the
+    spaces of these, and values are aggregated there before the projection. That is the same function as projecting
+    every edge, with less work and no tensor of size edges x H x d. Norm weights are folded into the projections. Terms
     that are constant over the neighbors cancel in the softmax of the keys and are added once for the values.
     """
 
@@ -442,12 +438,12 @@ class RelationAttention(nn.Module):
         """New features of the rows.
 
         Args:
-            x: features of the rows.
-            source: normalized (see `normalize`) features of all sources; None = they are in the neighborhoods' edge
-                features.
-            neighborhoods: the neighbors of each row. A row without any receives a message of exactly zero.
-            goal_edges: of goal-conditioned rows.
-            maps: `fold()`, where it has been computed already.
+            x: Features of the rows before the layer, not normalized.
+            source: Normalized (see `normalize`) features of all sources; None = the edge features of the neighborhoods
+                include these.
+            neighborhoods: Neighbors of each row. A row without a neighbor receives a message of exactly zero.
+            goal_edges: Goal edges of goal-conditioned rows; None = no row has a goal polyline.
+            maps: Result of `fold()` for the current weights; None = folded here.
         """
         target = self.target_norm(x)
         message = self._message(target, source, neighborhoods, self.fold() if maps is None else maps)
@@ -458,7 +454,7 @@ class RelationAttention(nn.Module):
         return x + self.feed_forward(x)
 
     def fold(self) -> AttentionMaps:
-        """The maps of the attention, which depend on weights alone."""
+        """Maps of the attention, which depend on weights alone."""
         norms = (self.relation_norm, self.source_norm or self.target_norm)
         values = (self.relation_value, self.source_value)
         to_key = self._by_head((self.relation_key, self.source_key), norms) / math.sqrt(self.head_dim)
@@ -478,41 +474,42 @@ class RelationAttention(nn.Module):
         rows = neighborhoods.rows
         query = self.query(target if rows is None else target[rows])
         query = query.unflatten(-1, (self.num_heads, self.head_dim)).transpose(0, 1)
-        spaces = 1 if source is None else 2
-        queries = tuple((query @ part).transpose(0, 1) for part in maps.to_key.chunk(spaces, -1))
+        num_spaces = 1 if source is None else 2
+        queries = tuple((query @ to_key).transpose(0, 1) for to_key in maps.to_key.chunk(num_spaces, -1))
         sums, weight = gather_edges(queries, source, neighborhoods, self.dropout if self.training else 0.0)
-        projected = [part.transpose(0, 1) @ to_part for part, to_part in zip(sums, maps.to_value.chunk(spaces, 1))]
+        to_values = maps.to_value.chunk(num_spaces, 1)
+        projected = [gathered.transpose(0, 1) @ to_value for gathered, to_value in zip(sums, to_values)]
         value = torch.stack(projected).sum(0).transpose(0, 1)  # [n, H, d]
         # weights sum to 1, unless dropout zeroed some
         value = value + weight * maps.constant
         # 2. back to all rows
         if rows is None:
-            assert neighborhoods.has_any is not None
-            return torch.where(neighborhoods.has_any[:, None], value.flatten(-2), 0.0)
+            assert neighborhoods.has_neighbor is not None
+            return torch.where(neighborhoods.has_neighbor[:, None], value.flatten(-2), 0.0)
         message = target.new_zeros(len(target), self.num_heads * self.head_dim)
         return message.index_copy(0, rows, value.flatten(-2))
 
     def _apply_goal_edges(
         self, message: Float[Tensor, "R inner"], target: Float[Tensor, "R D"], edges: GoalEdges
     ) -> Float[Tensor, "R inner"]:
-        """Blend each goal-conditioned row's message with the value of its goal edge.
+        """Blend each goal-conditioned row's message with the value of the goal edge.
 
         The weight of the goal edge is tanh(s / 2), where s is the score that the goal embedding adds to the
-        relation. By so much the weight of a goal relation exceeds that of an ordinary one if a row attends to these
-        two. A goal embedding of zero gives exactly zero.
+        relation. By so much the weight of a goal relation exceeds the weight of an ordinary relation if a row attends
+        to these two. A goal embedding of zero gives exactly zero.
         """
         norms = (self.relation_norm, self.source_norm or self.target_norm)
-        own = message[edges.rows].unflatten(-1, (self.num_heads, self.head_dim))  # [g, H, d]
+        start = message[edges.rows].unflatten(-1, (self.num_heads, self.head_dim))  # [g, H, d]
         query = self.query(target[edges.rows]).unflatten(-1, (self.num_heads, self.head_dim))
         # the score is linear in the relation, so the difference of relations gives the difference of scores
         key = functional.linear((edges.goal_relation - edges.relation) * norms[0].weight, self.relation_key.weight)
         score = (query * key.view_as(query)).sum(-1, keepdim=True) / math.sqrt(self.head_dim)  # [g, H, 1]
-        parts = zip((self.relation_value, self.source_value), norms, (edges.goal_relation, edges.features))
-        value = torch.stack([to_value(part * norm.weight + norm.bias) for to_value, norm, part in parts]).sum(0)
-        change = torch.tanh(score / 2) * (value.view_as(own) - own)
+        terms = zip((self.relation_value, self.source_value), norms, (edges.goal_relation, edges.features))
+        value = torch.stack([to_value(x * norm.weight + norm.bias) for to_value, norm, x in terms]).sum(0)
+        change = torch.tanh(score / 2) * (value.view_as(start) - start)
         return message.index_add(0, edges.rows, change.flatten(-2).to(message.dtype))
 
     def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d W"]:
-        """Weights of maps of relations and sources with their norms' weights inside."""
+        """Weights of maps of relations and sources, with the weights of the norms inside."""
         folded = torch.cat([linear.weight * norm.weight for linear, norm in zip(maps, norms)], -1)
         return folded.unflatten(0, (self.num_heads, self.head_dim))

@@ -17,15 +17,15 @@ from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.documents import printable
 from rlftsim.jobs.files import save_tensors
 from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
-from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
+from rlftsim.policies.smart.catk_keys import PREFIX, catk_name, find_aliases
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
     PUBLISHED_NUM_TOKENS,
-    is_published,
+    has_published_tokens,
     read_catk_vocabulary,
 )
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
-from rlftsim.policies.smart.lightning_file import mapping_in, read_lightning
+from rlftsim.policies.smart.lightning_file import find_group, read_lightning
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.tokens.vocabulary import MAX_TOKENS, STEPS_PER_TOKEN
@@ -65,30 +65,30 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
     Args:
         checkpoint: `.safetensors` with the keys of the public code's state dict, or a Lightning checkpoint.
-        vocabulary: the token tables it was trained with, see `read_catk_vocabulary`.
+        vocabulary: Files of the token tables that the model was trained with, see `read_catk_vocabulary`.
 
     Returns:
-        The model in evaluation mode, with `catk_compat` on, so that it computes what the public code computes.
+        The model in evaluation mode, with `catk_compat` on, so that the outputs are those of the public code.
 
     Raises:
-        CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
+        CheckpointError: A file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
             or unequal where they must be equal (the first are named); the vocabulary does not belong to the weights.
     """
     weights, settings = _read(checkpoint)
-    config, source = _config_of(weights, settings, checkpoint)
+    config, source = _find_config(weights, settings, checkpoint)
     head = weights.get(_HEAD_BIAS, torch.zeros(PUBLISHED_NUM_TOKENS))
     if head.dim() != 1 or not 1 <= len(head) <= MAX_TOKENS:
         raise CheckpointError(f"{checkpoint}: {_HEAD_BIAS} has shape {tuple(head.shape)}, not one number a token.")
-    own = _translate(weights, outline(lambda: SmartNetwork(config, len(head))), str(checkpoint))
+    weights = _translate(weights, outline(lambda: SmartNetwork(config, len(head))), str(checkpoint))
     tables = read_catk_vocabulary(vocabulary)
     if tables.num_tokens != len(head) or not tables.token_mask.all():
         raise CheckpointError(
             f"{checkpoint}: predicts {len(head)} tokens a class, the vocabulary holds "
             f"{', '.join(str(int(n)) for n in tables.token_mask.sum(1))}: hand over the one it was trained with."
         )
-    note = _vocabulary_note(settings, is_published(tables), checkpoint)
+    note = _vocabulary_note(settings, has_published_tokens(tables), checkpoint)
     policy = SmartPolicy(config, tables)
-    policy.network.load_state_dict(own)
+    policy.network.load_state_dict(weights)
     sizes = (name for name, preset in PRESETS.items() if replace(preset(), catk_compat=True) == config)
     return CatkImport(policy.eval(), next(sizes, "custom"), (source, note))
 
@@ -97,38 +97,36 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
     """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits.
 
     Raises:
-        CheckpointError: the model is goal-conditioned, or its head is none of the public code.
+        CheckpointError: The model is goal-conditioned, or has a head that the public code lacks.
     """
+    lacking = "has no form in the public CAT-K code"
     if policy.is_goal_conditioned:
-        raise CheckpointError(
-            "a goal-conditioned model has no form in the public CAT-K code: export the one it came from."
-        )
+        raise CheckpointError(f"a goal-conditioned model {lacking}: export the one it came from.")
     if policy.config.head_per_class:
         raise CheckpointError(
-            "a model with head_per_class has no form in the public CAT-K code, which has one head for all classes: "
+            f"a model with head_per_class {lacking}, which has one head for all classes: "
             "train one with model.head_per_class=false."
         )
     if policy.config.continuation_scores:
         raise CheckpointError(
-            "a model with continuation_scores has no form in the public CAT-K code: train one with "
-            "model.continuation_scores=false."
+            f"a model with continuation_scores {lacking}: train one with model.continuation_scores=false."
         )
     named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
-    return named | {second: named[first].clone() for second, first in aliases(named).items()}
+    return named | {second: named[first].clone() for second, first in find_aliases(named).items()}
 
 
 def write_catk(policy: SmartPolicy, path: Path) -> None:
     """Write `export_catk` as a safetensors file, whole or not at all.
 
     Args:
-        policy: goal-free, with one head for all classes.
-        path: of the file.
+        policy: Goal-free model with a single head for all classes.
+        path: Path of the new file, which ends in `.safetensors`.
     """
     save_tensors(path, export_catk(policy))
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights by the public code's names, and the decoder's settings and token file names where the file has them."""
+    """Weights by the public code's names, and the file's settings of the decoder and the tokens, empty without any."""
     if path.suffix == ".safetensors":
         try:
             weights, _ = read_tensors(path, "get the file again", error=CheckpointError)
@@ -137,31 +135,37 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             raise CheckpointError(f"{path}: no such file.") from None
     else:
         file = read_lightning(path)
-        weights, settings = file.weights, mapping_in(file.settings, "model_config")
+        weights, settings = file.weights, find_group(file.settings, "model_config")
     weights = dict(strip_wrappers(weights, ()))
     if not any(key.startswith(PREFIX) for key in weights):
         weights = {PREFIX + key: value for key, value in weights.items()}
     return weights, settings
 
 
-def _config_of(weights: dict[str, Tensor], settings: dict[str, Any], path: Path) -> tuple[SmartConfig, str]:
-    """The architecture, and a note on its source: the file's settings, else the shapes of the weights."""
+def _find_config(weights: dict[str, Tensor], settings: dict[str, Any], path: Path) -> tuple[SmartConfig, str]:
+    """The architecture, and a note on the source: the file's settings, else the shapes of the weights."""
     # 1. a Lightning checkpoint has the settings. Radii and probabilities may be integers there, here they are floats
-    decoder = mapping_in(settings, "decoder")
+    decoder = find_group(settings, "decoder")
     values = {ours: decoder[theirs] for theirs, ours in _FIELD_OF_SETTING.items() if theirs in decoder}
     if len(values) == len(_FIELD_OF_SETTING) and isinstance(decoder.get("time_span"), int):
         try:
-            kinds = {name: type(value) for name, value in vars(SmartConfig()).items()}
-            typed = {name: kinds[name](value) for name, value in values.items()}
+            defaults = vars(SmartConfig())
+            typed = {name: type(defaults[name])(value) for name, value in values.items()}
             config = SmartConfig(**typed, history_tokens=decoder["time_span"] // STEPS_PER_TOKEN)
         except (TypeError, ValueError, OverflowError, ConfigError) as error:
             raise CheckpointError(f"{path}: settings of the decoder make no sense: {error}") from None
         return replace(config, catk_compat=True), "sizes and radii: from the checkpoint's settings"
-    # 2. a safetensors file has none: one of the published sizes, or nothing
+    # 2. a safetensors file has none: the shapes of the weights say which of the published sizes, if any
+    probe = weights.get(_SHAPE_PROBE)
+    inner, dim = probe.shape if probe is not None and probe.dim() == 2 else (0, 0)
+    depths = (
+        len({key.split(".")[3] for key in weights if key.startswith(PREFIX + stem)})
+        for stem in ("map_encoder.pt2pt_layers.", "agent_encoder.t_attn_layers.")
+    )
+    shapes = (dim, inner, *depths)
     for name, preset in PRESETS.items():
         size = preset()
-        shapes = (size.dim, size.num_heads * size.head_dim, size.num_map_layers, size.num_decoder_layers)
-        if _shapes_of(weights) == shapes:
+        if shapes == (size.dim, size.num_heads * size.head_dim, size.num_map_layers, size.num_decoder_layers):
             return replace(size, catk_compat=True), f"sizes: recognized as {name}; radii: those of {name}"
     raise CheckpointError(
         f"{path}: not a SMART model of the public CAT-K code in one of the sizes {', '.join(PRESETS)} "
@@ -169,47 +173,35 @@ def _config_of(weights: dict[str, Tensor], settings: dict[str, Any], path: Path)
     )
 
 
-def _shapes_of(weights: dict[str, Tensor]) -> tuple[int, int, int, int]:
-    """Width, inner width of the attention, numbers of layers in map encoder and decoder; zeros where unknown."""
-    probe = weights.get(_SHAPE_PROBE)
-    inner, dim = probe.shape if probe is not None and probe.dim() == 2 else (0, 0)
-    layers = (
-        {key.split(".")[3] for key in weights if key.startswith(PREFIX + stem)}
-        for stem in ("map_encoder.pt2pt_layers.", "agent_encoder.t_attn_layers.")
-    )
-    return dim, inner, *(len(found) for found in layers)  # type: ignore[return-value]
-
-
-def _vocabulary_note(settings: dict[str, Any], published: bool, path: Path) -> str:
-    """Note on the vocabulary: published or not, and the one that the checkpoint names.
+def _vocabulary_note(settings: dict[str, Any], is_published: bool, path: Path) -> str:
+    """Note on the vocabulary: published or not, and the file that the checkpoint names.
 
     Raises:
-        CheckpointError: the checkpoint names the published table, and this is another one.
+        CheckpointError: The checkpoint names the published table, and this is another.
     """
-    named = mapping_in(settings, "token_processor").get("agent_token_file")
-    if named == PUBLISHED_AGENT_FILE and not published:
+    named = find_group(settings, "token_processor").get("agent_token_file")
+    if named == PUBLISHED_AGENT_FILE and not is_published:
         raise CheckpointError(f"{path}: was trained with {named}, the vocabulary is another one: hand over that table.")
-    what = f"the published {PUBLISHED_AGENT_FILE}" if published else "not a published one"
+    note = f"vocabulary: the published {PUBLISHED_AGENT_FILE}" if is_published else "vocabulary: not a published one"
     if named is None:
-        return f"vocabulary: {what}; the checkpoint does not say which one it was trained with"
-    if published and named != PUBLISHED_AGENT_FILE:
-        return f"vocabulary: {what}; the checkpoint names {named}: make sure that it is the same table"
-    return f"vocabulary: {what}; the checkpoint names {named}"
+        return f"{note}; the checkpoint does not say which one it was trained with"
+    is_other = is_published and named != PUBLISHED_AGENT_FILE
+    return f"{note}; the checkpoint names {named}" + (": make sure that it is the same table" if is_other else "")
 
 
-def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Weights under our names, those of a network's state dict.
+def _translate(weights: dict[str, Tensor], expected: dict[str, Tensor], source: str) -> dict[str, Tensor]:
+    """Weights under this package's names, those of a network's state dict.
 
     Raises:
-        CheckpointError: the first things that are missing, unknown, of the wrong shape or kind, or unequal to its
-            second name.
+        CheckpointError: Weights are missing, unknown, of the wrong shape or type, or unequal under a second name; the
+            first are named.
     """
     # shapes of all names that must be there, second names of shared norms included
-    names = {catk_name(key): key for key in own}
-    seconds = aliases(names)
-    shapes = {name: own[key].shape for name, key in names.items()}
-    shapes |= {second: shapes[first] for second, first in seconds.items()}
-    # collect all problems before refusing: a user mends them at once
+    keys = {catk_name(key): key for key in expected}
+    aliases = find_aliases(keys)
+    shapes = {name: expected[key].shape for name, key in keys.items()}
+    shapes |= {second: shapes[first] for second, first in aliases.items()}
+    # collect all problems, so that a user mends them at once
     problems = [f"missing {name}" for name in sorted(shapes.keys() - weights.keys())]
     problems += [f"unknown {name[:100]}" for name in sorted(weights.keys() - shapes.keys())]
     for name in sorted(shapes.keys() & weights.keys()):
@@ -220,10 +212,10 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
             problems.append(f"{name} is {value.dtype} instead of torch.float32")
         elif not value.isfinite().all():
             problems.append(f"{name} holds values that are not finite")
-    for second, first in sorted(seconds.items()):
+    for second, first in sorted(aliases.items()):
         if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
             problems.append(f"{second} differs from {first}, which must be the same")
     if problems:
-        shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {printable(shown)}.")
-    return {key: weights[name] for name, key in names.items()}
+        listed = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {printable(listed)}.")
+    return {key: weights[name] for name, key in keys.items()}

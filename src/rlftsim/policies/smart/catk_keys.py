@@ -6,7 +6,7 @@ PREFIX = "encoder."
 
 _PLAIN, _MLP, _FOURIER, _ATTENTION = "plain", "mlp", "fourier", "attention"
 
-_PARTS = (
+_SUBMODULES = (
     ("map_encoder.feature_type", "map_encoder.type_pt_emb", _PLAIN),
     ("map_encoder.kind", "map_encoder.polygon_type_emb", _PLAIN),
     ("map_encoder.light", "map_encoder.light_pl_emb", _PLAIN),
@@ -28,7 +28,7 @@ _PARTS = (
     ("decoder.agent_layers", "agent_encoder.a2a_attn_layers", _ATTENTION),
     ("decoder.head", "agent_encoder.token_predict_head", _MLP),
 )
-"""Prefix of a part of the network here, its prefix there, and the kind of the part."""
+"""Prefix of a submodule of the network here, its prefix in the public code, and the type of the submodule."""
 
 _IN_FOURIER = {"frequencies": "freqs", "inputs": "mlps", "out": "to_out"}
 _IN_ATTENTION = {
@@ -52,29 +52,30 @@ _IN_ATTENTION = {
 
 
 def catk_name(key: str) -> str:
-    """The public code's name of one of our weights."""
-    # the longest prefix, as "decoder.tokens.1" is also one of "decoder.tokens.10"
-    own, theirs, kind = max((p for p in _PARTS if key.startswith(p[0] + ".")), key=lambda p: len(p[0]))
-    rest = key[len(own) + 1 :]
-    if kind == _MLP:
-        rest = f"mlp.{rest}"
-    elif kind == _FOURIER:
-        first, _, inner = rest.partition(".")
-        rest = f"{_IN_FOURIER[first]}.{inner}"
-    elif kind == _ATTENTION:
-        layer, _, inner = rest.partition(".")
-        part, _, parameter = inner.rpartition(".")
-        rest = f"{layer}.{_IN_ATTENTION[part]}.{parameter}"
-    return f"{PREFIX}{theirs}.{rest}"
+    """The public code's name of a weight of this package."""
+    # the longest prefix, as "decoder.tokens.1" is also a prefix of "decoder.tokens.10"
+    submodules = (entry for entry in _SUBMODULES if key.startswith(entry[0] + "."))
+    prefix, catk_prefix, module_type = max(submodules, key=lambda entry: len(entry[0]))
+    name = key[len(prefix) + 1 :]
+    if module_type == _MLP:
+        name = f"mlp.{name}"
+    elif module_type == _FOURIER:
+        first, _, parameter = name.partition(".")
+        name = f"{_IN_FOURIER[first]}.{parameter}"
+    elif module_type == _ATTENTION:
+        layer, _, name = name.partition(".")
+        module, _, parameter = name.rpartition(".")
+        name = f"{layer}.{_IN_ATTENTION[module]}.{parameter}"
+    return f"{PREFIX}{catk_prefix}.{name}"
 
 
-def alias_of(name: str) -> str | None:
-    """Second name under which the public code stores the same weight: one norm for both ends of a relation."""
-    if ".attn_prenorm_x_dst." in name and ".pt2a_attn_layers." not in name:
-        return name.replace(".attn_prenorm_x_dst.", ".attn_prenorm_x_src.")
-    return None
+def find_aliases(names: Iterable[str]) -> dict[str, str]:
+    """Second names of weights that the public code stores twice, each with the first name.
 
-
-def aliases(names: Iterable[str]) -> dict[str, str]:
-    """Second names of weights that are stored twice, each with its first name."""
-    return {second: name for name in names if (second := alias_of(name))}
+    There a single norm serves both ends of most relations.
+    """
+    return {
+        name.replace(".attn_prenorm_x_dst.", ".attn_prenorm_x_src."): name
+        for name in names
+        if ".attn_prenorm_x_dst." in name and ".pt2a_attn_layers." not in name
+    }

@@ -1,4 +1,4 @@
-"""Token tables of the public CAT-K code, which its checkpoints need and do not hold."""
+"""Token tables of the public CAT-K code, which are no part of a checkpoint."""
 
 import hashlib
 from collections.abc import Sequence
@@ -31,31 +31,37 @@ def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
     """Token tables from npz files, or from one vocabulary file of this package.
 
     Args:
-        paths: npz files that hold, between them, `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, 11, 2],
+        paths: Files of type npz that together hold `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, 11, 2],
             meters; or a single `.safetensors` written by `Vocabulary.save`.
 
     Raises:
-        CheckpointError: a table is missing or has the wrong size, or a file cannot be read.
+        CheckpointError: A table is missing or has the wrong size, or a file cannot be read.
     """
     if len(paths) == 1 and paths[0].suffix == ".safetensors":
         try:
             return Vocabulary.load(paths[0])
         except DataError as error:
             raise CheckpointError(str(error)) from None
-    tables = {name: table for path in paths for name, table in _read_npz(path).items()}
-    where = ", ".join(str(p) for p in paths)
-    missing = [name for name in (*MOTION_TABLES, MAP_TABLE) if name not in tables]
+    names, tables = (*MOTION_TABLES, MAP_TABLE), {}
+    for path in paths:
+        try:
+            way_out = "not an npz of token tables (pickles are not read, see docs/catk.md)"
+            tables |= read_npz(path, names, way_out, error=CheckpointError)
+        except FileNotFoundError:
+            raise CheckpointError(f"{path}: no such vocabulary.") from None
+    source = ", ".join(str(p) for p in paths)
+    missing = [name for name in names if name not in tables]
     if missing:
-        raise CheckpointError(f"{where}: no table {', '.join(missing)}: hand over veh, ped, cyc and traj_src.")
-    _check_sizes(tables, where)
+        raise CheckpointError(f"{source}: no table {', '.join(missing)}: hand over veh, ped, cyc and traj_src.")
+    _check_tables(tables, source)
     # classes in this package's order: vehicles, pedestrians, cyclists [3, V, 6, 4, 2]
     corners = torch.from_numpy(np.stack([tables[name] for name in MOTION_TABLES]).astype(np.float32))
     prototypes = torch.from_numpy(tables[MAP_TABLE].astype(np.float32))
     mask = torch.ones(corners.shape[:2], dtype=torch.bool)
-    return Vocabulary(corners, mask, prototypes, origin=f"imported from {where}")
+    return Vocabulary(corners, mask, prototypes, origin=f"imported from {source}")
 
 
-def is_published(vocabulary: Vocabulary) -> bool:
+def has_published_tokens(vocabulary: Vocabulary) -> bool:
     """True if the motion tokens are those that CAT-K published, by sha256."""
     tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
     return all(
@@ -68,11 +74,11 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     """Write the tables as npz, in the form `read_catk_vocabulary` takes.
 
     Args:
-        vocabulary: any whose classes have equally many tokens.
-        path: of the file, written whole or not at all.
+        vocabulary: Vocabulary whose classes have equally many tokens.
+        path: Path of the new npz file, written whole or not at all.
 
     Raises:
-        DataError: the file cannot be written.
+        DataError: The file cannot be written.
     """
     motions = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
     tables = {**motions, MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()}
@@ -84,34 +90,32 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     write_atomically(path, write)
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    way_out = "not an npz of token tables (pickles are not read, see docs/catk.md)"
-    try:
-        return read_npz(path, (*MOTION_TABLES, MAP_TABLE), way_out, error=CheckpointError)
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such vocabulary.") from None
+def _check_tables(tables: dict[str, np.ndarray], source: str) -> None:
+    """Check shapes, types, numbers of tokens and coordinates of the tables.
 
-
-def _check_sizes(tables: dict[str, np.ndarray], where: str) -> None:
-    wanted = {name: ("V", *_AGENT_SHAPE) for name in MOTION_TABLES} | {MAP_TABLE: ("P", *_MAP_SHAPE)}
-    wrong = [
+    Raises:
+        CheckpointError: A table is not as the public code has it; the message names the first kind of mistake.
+    """
+    shapes = {name: ("V", *_AGENT_SHAPE) for name in MOTION_TABLES} | {MAP_TABLE: ("P", *_MAP_SHAPE)}
+    problems = [
         f"{name} has shape {tables[name].shape} instead of ({', '.join(map(str, shape))})"
-        for name, shape in wanted.items()
+        for name, shape in shapes.items()
         if tables[name].shape[1:] != shape[1:] or tables[name].ndim != len(shape)
     ]
-    wrong += [
-        f"{name} holds {tables[name].dtype}, not numbers" for name in wanted if tables[name].dtype.kind not in "fiu"
+    problems += [
+        f"{name} holds {tables[name].dtype}, not numbers" for name in shapes if tables[name].dtype.kind not in "fiu"
     ]
-    counts = {len(tables[name]) for name in MOTION_TABLES} if not wrong else set()
-    if not wrong and not 1 <= min(counts) <= max(counts) <= MAX_TOKENS:
-        wrong = [f"a class has {max(counts)} tokens, there are 1 to {MAX_TOKENS}"]
-    if not wrong and len(counts) > 1:
-        wrong = [f"veh, ped and cyc have different numbers of tokens ({', '.join(map(str, sorted(counts)))})"]
-    if not wrong:
-        wrong = [
+    if not problems:
+        counts = {len(tables[name]) for name in MOTION_TABLES}
+        if not 1 <= min(counts) <= max(counts) <= MAX_TOKENS:
+            problems = [f"a class has {max(counts)} tokens, there are 1 to {MAX_TOKENS}"]
+        elif len(counts) > 1:
+            problems = [f"veh, ped and cyc have different numbers of tokens ({', '.join(map(str, sorted(counts)))})"]
+    if not problems:
+        problems = [
             f"{name} holds values that are not finite, or beyond {MAX_COORDINATE_M:g} m"
-            for name in wanted
+            for name in shapes
             if not (np.abs(tables[name]) <= MAX_COORDINATE_M).all()
         ]
-    if wrong:
-        raise CheckpointError(f"{where}: {'; '.join(wrong)}.")
+    if problems:
+        raise CheckpointError(f"{source}: {'; '.join(problems)}.")

@@ -1,9 +1,9 @@
 """Sizes and radii of a SMART model."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
-from rlftsim.errors import ConfigError, check_limits, given, require_finite, require_positive, require_types
+from rlftsim.errors import ConfigError, check_finiteness, check_limits, check_positive, check_types, given
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
@@ -31,7 +31,7 @@ class SmartConfig:
     num_frequencies: int = 64
     """Learned frequencies per input of the Fourier embeddings."""
     frequency_init: FrequencyInit = "normal"
-    """Their values in a fresh model. normal: N(0, 0.02), as in the public code, which is one period in 50 m and more.
+    """Frequencies of a fresh model. normal: N(0, 0.02), as in the public code, which is one period in 50 m and more.
     log_spaced: from 1/64 to 1 per meter (and radian), with which a model learns to read the map far sooner."""
     map_radius_m: float = 10.0
     """Radius within which a map token attends to other map tokens."""
@@ -40,7 +40,7 @@ class SmartConfig:
     agent_radius_m: float = 60.0
     """Radius within which an agent attends to other agents."""
     history_tokens: int = 6
-    """Earlier token steps (0.5 s) of its own that an agent attends to."""
+    """Earlier token steps (0.5 s) of the same agent that an agent attends to."""
     max_map_neighbors: int | None = 100
     """Most map tokens that a map token attends to, the nearest ones; None = all within the radius."""
     max_agent_map_neighbors: int | None = None
@@ -78,28 +78,15 @@ class SmartConfig:
         return 0.0 if self.catk_compat else 1e-3
 
     def __post_init__(self) -> None:
-        require_types(self)
-        sizes = (
-            "dim",
-            "num_heads",
-            "head_dim",
-            "num_map_layers",
-            "num_decoder_layers",
-            "num_frequencies",
-            "history_tokens",
-        )
+        check_types(self)
+        depths = ("num_map_layers", "num_decoder_layers", "history_tokens")
+        widths = ("dim", "num_heads", "head_dim", "num_frequencies")
         radii = ("map_radius_m", "agent_map_radius_m", "agent_radius_m")
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
-        require_positive(self, (*sizes, *radii, *given(self, caps)))
-        require_finite(self, radii)
-        check_limits(self, dict.fromkeys(("num_map_layers", "num_decoder_layers", "history_tokens"), 256))
-        check_limits(self, dict.fromkeys(("dim", "num_heads", "head_dim", "num_frequencies"), 65_536))
+        check_positive(self, (*widths, *depths, *radii, *given(self, caps)))
+        check_finiteness(self, radii)
+        check_limits(self, dict.fromkeys(depths, 256) | dict.fromkeys(widths, 65_536))
         check_limits(self, dict.fromkeys(radii, 100_000) | dict.fromkeys(caps, 2**31 - 1))
-        if self.frequency_init not in get_args(FrequencyInit):
-            known = ", ".join(get_args(FrequencyInit))
-            raise ConfigError(f"frequency_init={self.frequency_init!r} is none of the known ones: {known}.")
-        if self.goal is not None and self.goal not in get_args(GoalEncoding):
-            raise ConfigError(f"goal={self.goal!r} is no goal encoding: known are {', '.join(get_args(GoalEncoding))}.")
         if self.goal_logit_bias and self.goal is None:
             raise ConfigError("goal_logit_bias=True, but the model is goal-free: set goal to concat or indication.")
         if self.continuation_scores and self.head_per_class:
@@ -113,15 +100,15 @@ class SmartConfig:
             )
 
     def with_goal_conditioning(self, goal: GoalEncoding, logit_bias: bool | None) -> "SmartConfig":
-        """The same model, goal-conditioned; itself if it is conditioned in this way.
+        """The same model, goal-conditioned; the unchanged settings of a model that is conditioned in this way.
 
         Args:
-            goal: encoding of goals.
-            logit_bias: add a goal-progress bias to the token logits; None = yes for a goal-free model, else as the
-                model has it.
+            goal: Encoding of goals that the new model has, "concat" or "indication".
+            logit_bias: Whether a goal-progress bias is added to the token logits; None = yes for a goal-free model,
+                else as the model does.
 
         Raises:
-            ConfigError: it is conditioned in another way.
+            ConfigError: The model is conditioned in another way.
         """
         if self.goal is None:
             return replace(self, goal=goal, goal_logit_bias=logit_bias is not False)

@@ -15,8 +15,8 @@ def draw_dropout(x: Float[Tensor, "*shape"], probability: float) -> Float[Tensor
     """Independent factors: zero with a probability, else so large that the mean is one.
 
     Args:
-        x: a tensor of the shape, type and device of the factors.
-        probability: of zero.
+        x: Tensor with the shape, the type and the device of the factors; no value is read.
+        probability: Chance in [0, 1) that a factor is zero, rounded to a multiple of 1 / 65 536.
     """
     num_dropped = round(probability * CHANCES)
     words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-(1 << 63), None)

@@ -28,31 +28,30 @@ def initialize(module: nn.Module, frequency_init: FrequencyInit) -> None:
     """Draw the weights of all linear maps and embedding tables inside a module anew, in the order of `modules()`.
 
     Args:
-        module: the whole network.
+        module: Complete network, whose weights are overwritten in place.
         frequency_init: "normal" draws the frequencies of Fourier embeddings like any other table. Almost all of these
-            have periods of tens of meters, which cannot tell a lane from the next one. "log_spaced" sets them to
-            periods from 64 down to 1, the same for every input.
+            have periods of tens of meters, which cannot tell a lane from the next. "log_spaced" sets periods from 64
+            down to 1, the same for every input.
     """
-    for part in module.modules():
-        if isinstance(part, nn.Linear):
-            nn.init.xavier_uniform_(part.weight)
-            if part.bias is not None:
-                nn.init.zeros_(part.bias)
-        elif isinstance(part, nn.Embedding):
-            nn.init.normal_(part.weight, std=0.02)
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        elif isinstance(layer, nn.Embedding):
+            nn.init.normal_(layer.weight, std=0.02)
     if frequency_init == "log_spaced":
-        for part in module.modules():
-            if isinstance(part, FourierEmbedding):
-                weight = part.frequencies.weight  # [n, F]
-                spaced = torch.logspace(-math.log10(LONGEST_PERIOD), 0.0, weight.shape[1])
+        for layer in module.modules():
+            if isinstance(layer, FourierEmbedding):
+                weight = layer.frequencies.weight  # [n, F]
                 with torch.no_grad():
-                    weight.copy_(spaced.expand_as(weight))
+                    weight.copy_(torch.logspace(-math.log10(LONGEST_PERIOD), 0.0, weight.shape[1]).expand_as(weight))
 
 
 def normalize(x: Float[Tensor, "... D"]) -> Float[Tensor, "... D"]:
     """Layer norm without weights.
 
-    It is computed once for all layers that read x; each layer folds its own norm weights in.
+    Computed once for all layers that read x; each layer folds the weights of a norm in.
     """
     return functional.layer_norm(x, x.shape[-1:], eps=EPSILON)
 
@@ -81,7 +80,7 @@ class MlpLayer(nn.Sequential):
 class FourierEmbedding(nn.Module):
     """Continuous values [E, n] -> [E, D] through learned frequencies.
 
-    Each input has a small network of its own. Their outputs are summed and go through one more map.
+    Each input has a small network. The outputs of these networks are summed and go through a last map.
     """
 
     def __init__(self, num_inputs: int, dim: int, num_frequencies: int):
@@ -98,25 +97,23 @@ class FourierEmbedding(nn.Module):
         """Embedding of each row.
 
         Args:
-            values: the inputs, in their own units.
-            extra: categorical embeddings that join the sum over inputs.
+            values: Inputs of each row, each input in its unit (meters, radians).
+            extra: Categorical embeddings that join the sum over inputs, before the last map.
         """
         total = self.embed_inputs(values)
         return self.out(total if extra is None else total + extra)
 
     def embed_inputs(self, values: Float[Tensor, "E n"]) -> Float[Tensor, "E D"]:
         """Sum over inputs, before the last map."""
-        total = self.embed_input(0, values[:, 0])
-        for index in range(1, len(self.inputs)):
-            total = total + self.embed_input(index, values[:, index])
-        return total
+        terms = (self.embed_input(index, column) for index, column in enumerate(values.unbind(-1)))
+        return sum(terms, next(terms))
 
     def embed_input(self, index: int, values: Float[Tensor, "E"]) -> Float[Tensor, "E D"]:
         """Term of the sum that a single input adds.
 
         Args:
-            index: number of the input.
-            values: of this input.
+            index: Number of the input, from 0 to n - 1.
+            values: Value of this input in each row.
         """
         angles = 2 * math.pi * values[:, None] * self.frequencies.weight[index]  # [E, F]
         return self.inputs[index](torch.cat([angles.cos(), angles.sin(), values[:, None]], -1))
@@ -141,10 +138,10 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class TabulatedEmbedding:
-    """A FourierEmbedding as a lookup table, interpolated linearly: each input's term is a function of one number.
+    """A FourierEmbedding as a lookup table, interpolated linearly: each input's term is a function of a single number.
 
     There are far fewer grid points than relations, so this is also the fast way to train: gradients flow through
-    the table. Values outside a grid count as its end.
+    the table. A value outside a grid counts as the end of the grid.
     """
 
     table: Float[Tensor, "rows D"]
@@ -163,8 +160,8 @@ class TabulatedEmbedding:
         """Table of an embedding.
 
         Args:
-            embedding: evaluated on the grids, with gradient.
-            grids: one for each of its inputs.
+            embedding: Embedding to evaluate on the grids, with gradient.
+            grids: Grid of each input, in the order of the embedding's inputs.
         """
         like = embedding.frequencies.weight
         steps = [torch.linspace(g.start, g.stop, g.count, dtype=like.dtype, device=like.device) for g in grids]
@@ -188,9 +185,9 @@ class TabulatedEmbedding:
         """Sum over inputs, before the last map."""
         values = torch.where(self.of_roots, values.abs().sqrt(), values)
         # fractional index into each input's grid [E, n], and the grid point below it
-        place = torch.minimum(((values - self.start) / self.spacing).clamp(min=0), self.last)
-        low = torch.minimum(place.floor(), self.last - 1)
-        weight = place - low
+        grid_index = torch.minimum(((values - self.start) / self.spacing).clamp(min=0), self.last)
+        low = torch.minimum(grid_index.floor(), self.last - 1)
+        weight = grid_index - low
         row = low.long() + self.first_row
         # one bag per relation: both neighbors of every input, weighted; no tensor [E, 2n, D] is made
         return functional.embedding_bag(
@@ -209,19 +206,19 @@ class TabulatedEmbedding:
 RelationEmbedding = FourierEmbedding | TabulatedEmbedding
 
 
-def tabulate(embedding: FourierEmbedding, reach_m: float, *more: Grid) -> RelationEmbedding:
-    """Table of an embedding of relations, or the embedding itself while it is trained without dropout.
+def tabulate(embedding: FourierEmbedding, reach_m: float, *extra_grids: Grid) -> RelationEmbedding:
+    """Table of an embedding of relations, or the unchanged embedding while training without dropout.
 
-    Then a gradient is taken to be exact, and interpolation would not be.
+    In that case a gradient has to be exact, and interpolation is not.
 
     Args:
-        embedding: of (distance, bearing, difference of heading, ...), meters and radians.
-        reach_m: largest distance.
-        more: grids of the inputs that follow these three.
+        embedding: Embedding of (distance, bearing, difference of heading, ...), meters and radians.
+        reach_m: Largest distance of the table, meters; a larger distance counts as this one.
+        extra_grids: Grids of the inputs that follow these three.
     """
     if not (embedding.is_frozen or embedding.training):
         return embedding
     root = math.sqrt(reach_m)
     distance = Grid(0.0, root, round(root * DISTANCES_PER_ROOT_M) + 1, of_roots=True)
     angle = Grid(-math.pi, math.pi, NUM_ANGLES)
-    return TabulatedEmbedding.build(embedding, (distance, angle, angle, *more))
+    return TabulatedEmbedding.build(embedding, (distance, angle, angle, *extra_grids))

@@ -24,7 +24,7 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.distributions import CategoricalDistribution, TokenDistribution
 from rlftsim.policies.smart.config import GoalEncoding
 from rlftsim.policies.smart.embeddings import FourierEmbedding, normalize
-from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
+from rlftsim.policies.smart.neighbors import Poses, find_neighbors, relative_pose
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
@@ -34,10 +34,10 @@ GOAL_POLYLINE_REACH_M = 200.0
 NUM_DECISIONS = FUTURE_STEPS // STEPS_PER_TOKEN
 TOKEN_S = STEPS_PER_TOKEN * STEP_S
 ROUNDING_MPS = 0.5
-"""Misfits smaller than this differ little: |x| is replaced by sqrt(x^2 + 0.5^2)."""
+"""Smaller misfits differ little: |x| is replaced by sqrt(x^2 + 0.5^2)."""
 BIAS_GAIN = 8.0
-"""Factor on the weights of the logit bias, so that the other weights' learning rate suits them: they are few and
-have far to go."""
+"""Factor on the weights of the logit bias, which are few and have far to go, so that the learning rate of the other
+weights suits."""
 ROWS_PER_BLOCK = 128
 """Rows whose tokens are processed together: on a processor they fit its cache."""
 ROWS_PER_BLOCK_ELSEWHERE = 1 << 12
@@ -54,24 +54,22 @@ class EncodedGoals:
 
 
 def encode_goals(goals: Goals, map_position: Float[Tensor, "B M 2"]) -> EncodedGoals:
-    """Find the polyline of each goal. A goal that is no finite point counts as none.
+    """Find the polyline of each goal. A goal that is no finite point is left out.
 
     Args:
-        goals: of all agents, map frame.
-        map_position: points of the map tokens, infinite for padding.
+        goals: Goals [B, N, A] of all agents, map frame, meters.
+        map_position: Points of the map tokens, map frame, meters; infinite for padding.
     """
     goals = goals.only(goals.position.isfinite().all(-1))
-    place = goals.goal_mask.nonzero(as_tuple=True)
-    nearest = within(
-        goals.position[place], place[0], map_position, None, radius_m=GOAL_POLYLINE_REACH_M, limit=1
-    )  # fmt: skip
+    rows = goals.goal_mask.nonzero(as_tuple=True)
+    nearest = find_neighbors(goals.position[rows], rows[0], map_position, None, radius_m=GOAL_POLYLINE_REACH_M, limit=1)
     polyline = torch.full(goals.goal_mask.shape, -1, device=goals.position.device)
-    polyline[place] = torch.where(nearest.mask, nearest.index, -1)[:, 0]
+    polyline[rows] = torch.where(nearest.mask, nearest.index, -1)[:, 0]
     return EncodedGoals(goals.position, goals.goal_mask, polyline)
 
 
-def rows_where(mask: Bool[Tensor, "R"]) -> Int64[Tensor, "g"]:
-    """Rows where a mask is True. Off the CPU all rows: to leave some out, the host would wait for their number."""
+def select_rows(mask: Bool[Tensor, "R"]) -> Int64[Tensor, "g"]:
+    """Rows where a mask is True. Off the CPU all rows: to leave some out, the host would wait for the number."""
     return mask.nonzero()[:, 0] if mask.device.type == "cpu" else torch.arange(len(mask), device=mask.device)
 
 
@@ -92,8 +90,8 @@ class GoalEmbedding(FourierEmbedding):
     def init_from(self, relation: FourierEmbedding) -> None:
         """Copy the networks of another embedding's first two inputs, which must be distance and bearing."""
         self.frequencies.weight.copy_(relation.frequencies.weight[:2])
-        for own, trained in zip(self.inputs, relation.inputs):
-            own.load_state_dict(trained.state_dict())
+        for layers, trained_layers in zip(self.inputs, relation.inputs):
+            layers.load_state_dict(trained_layers.state_dict())
 
     def embed(
         self, goals: EncodedGoals, poses: Poses, rows: tuple[Tensor, ...], *, seam_rad: float
@@ -101,18 +99,18 @@ class GoalEmbedding(FourierEmbedding):
         """Embeddings of the goals of rows.
 
         Args:
-            goals: of all agents.
-            poses: of the rows.
-            rows: scenario, rollout, agent and step of each.
-            seam_rad: see `relative_pose`.
+            goals: Goals [B, N, A] of all agents, in the frame of the poses.
+            poses: Poses [R] of the rows, meters and radians.
+            rows: Scenario, rollout, agent and step of each row, four indices [R].
+            seam_rad: Width of the seam of angles at -pi, see `relative_pose`.
 
         Returns:
-            The rows whose agents have goals (or all), and their embeddings, which are zero where there is no goal.
+            The rows whose agents have goals (or all rows), and an embedding of each, zero where there is no goal.
         """
-        place = rows[:3]
-        has_goal = goals.goal_mask[place]
-        conditioned = rows_where(has_goal)  # [g]
-        goal = goals.position[place][conditioned, None]  # [g, 1, 2]
+        agent = rows[:3]
+        has_goal = goals.goal_mask[agent]
+        conditioned = select_rows(has_goal)  # [g]
+        goal = goals.position[agent][conditioned, None]  # [g, 1, 2]
         # a goal has no heading; the difference of headings is computed and dropped
         values = relative_pose(poses[conditioned], Poses(goal, torch.zeros_like(goal[..., 0])), seam_rad=seam_rad)
         return conditioned, torch.where(has_goal[conditioned, None], self(values[:, 0, :2]), 0.0)
@@ -134,29 +132,27 @@ class GoalEdgeEmbedding(nn.Embedding):
         """Normalized embeddings of relations without and with the goal embedding.
 
         Args:
-            embedding: of relations.
-            values: of each relation.
+            embedding: Embedding of the relations to map tokens.
+            values: Distance, bearing and difference of heading of each relation, meters and radians.
         """
         goal = self.weight.expand(len(values), -1)  # [g, D]
-        nothing = torch.zeros_like(goal)  # added, so that both round alike in half precision
-        return normalize(embedding(values, nothing)), normalize(embedding(values, goal))
+        zeros = torch.zeros_like(goal)  # added, so that both round alike in half precision
+        return normalize(embedding(values, zeros)), normalize(embedding(values, goal))
 
 
-def goal_encoder(encoding: GoalEncoding | None, dim: int, frequencies: int) -> GoalEmbedding | GoalEdgeEmbedding | None:
+def build_goal_encoder(
+    encoding: GoalEncoding | None, dim: int, num_frequencies: int
+) -> GoalEmbedding | GoalEdgeEmbedding | None:
     """Module of a goal encoding, with random weights; None for a goal-free model.
 
     Args:
-        encoding: see the module's text.
-        dim: D.
-        frequencies: learned frequencies per input.
+        encoding: Encoding of goals, "concat" or "indication"; None = goal-free.
+        dim: Width D of all features of the model.
+        num_frequencies: Number of learned frequencies per input; only `concat` has these.
     """
-    match encoding:
-        case "concat":
-            return GoalEmbedding(dim, frequencies)
-        case "indication":
-            return GoalEdgeEmbedding(dim)
-        case None:
-            return None
+    if encoding is None:
+        return None
+    return GoalEmbedding(dim, num_frequencies) if encoding == "concat" else GoalEdgeEmbedding(dim)
 
 
 class GoalLogitBias(nn.Module):
@@ -165,12 +161,12 @@ class GoalLogitBias(nn.Module):
     With T the time left after a token:
 
     * progress: by how much the token brings the agent nearer to the goal, meters,
-    * pace: the rest of the way minus the token's speed times T, divided by 1 s + T,
+    * pace: the remaining distance minus the token's speed times T, divided by 1 s + T,
     * direction: distance from the goal after going straight on at the token's speed for T, divided by 1 s + T.
 
-    Pace and direction are misfits in m/s, rounded at zero (`ROUNDING_MPS`). The logit is raised by progress and
-    lowered by the misfits, each times its weight. So the policy becomes a product of the token's probability and of
-    how well it suits the goal, as for a random walk that is conditioned on its end (Doob's h-transform; here with a
+    Pace and direction are misfits in m/s, rounded at zero (`ROUNDING_MPS`). The logit is raised by weighted progress
+    and lowered by the weighted misfits. So the policy becomes a product of the token's probability and of the token's
+    suitability for the goal, as for a random walk that is conditioned on the end (Doob's h-transform; here with a
     learned, log-linear h). The goal is to be reached when the simulation ends.
     """
 
@@ -189,13 +185,13 @@ class GoalLogitBias(nn.Module):
         class_id: Int64[Tensor, "g"],
         moves: Float[Tensor, "C V 2"],
     ) -> Float[Tensor, "g V"]:
-        """Bias of the logits of all tokens. Differentiable in the weights.
+        """Bias of the logits of all tokens; differentiable in the weights, by the features of `suitability`.
 
         Args:
-            goal: meters, in the frame of each agent.
-            num_left: decisions left, this one included.
-            class_id: agent class that each row's token ids refer to.
-            moves: displacement by each token, meters, in the agent's frame.
+            goal: Goal of each row, meters, in the frame of its agent.
+            num_left: Number of decisions left, the next included, from 1 to 16.
+            class_id: Agent class that each row's token ids refer to.
+            moves: Displacement by each token, meters, in the agent's frame.
         """
         weights = BIAS_GAIN * self.weight[class_id, num_left - 1]  # [g, 3]
         with torch.autocast(goal.device.type, enabled=False):  # logits are float32
@@ -213,19 +209,19 @@ class GoalLogitBias(nn.Module):
         """Distribution with the bias added for agents that have goals.
 
         Args:
-            dist: of the elements of its mask [B, N, A] or [B, N, A, L].
-            goals: of all agents.
-            poses: of the agents before each decision, in the shape of the mask.
-            num_left: decisions left at each element, that one included.
-            class_id: of the agents.
-            vocabulary: of the tokens.
+            dist: Distributions without the bias, with a mask [B, N, A] or [B, N, A, L].
+            goals: Goals [B, N, A] of all agents, map frame.
+            poses: Poses of the agents before each decision, map frame, in the shape of the mask.
+            num_left: Number of decisions left at each element, the next included, from 1 to 16.
+            class_id: Agent class that each agent's token ids refer to.
+            vocabulary: Vocabulary of the tokens, whose boxes give the displacements.
         """
-        place = find_rows(dist.mask, len(dist.logits) == dist.mask.numel())
-        has_goal = goals.goal_mask[place[:3]]
-        conditioned = rows_where(has_goal)  # [g] of the R rows of dist
-        rows = tuple(index[conditioned] for index in place)
-        here = poses[rows]
-        goal = rotate(goals.position[rows[:3]] - here.position, -here.heading)  # [g, 2], agent's frame
+        elements = find_rows(dist.mask, len(dist.logits) == dist.mask.numel())
+        has_goal = goals.goal_mask[elements[:3]]
+        conditioned = select_rows(has_goal)  # [g] of the R rows of dist
+        rows = tuple(index[conditioned] for index in elements)
+        pose = poses[rows]
+        goal = rotate(goals.position[rows[:3]] - pose.position, -pose.heading)  # [g, 2], agent's frame
         row_class = class_id[rows[0], rows[2]]
         # a token's displacement is the mean of the four corners of its last box
         bias = self(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))  # [g, V]
@@ -241,13 +237,13 @@ def suitability(
     class_id: Int64[Tensor, "g"],
     moves: Float[Tensor, "C V 2"],
 ) -> Float[Tensor, "g 3 V"]:
-    """Features of `GoalLogitBias`: progress, minus pace, minus direction. Each is larger for a token that suits better.
+    """Features of `GoalLogitBias`: progress, minus pace, minus direction; larger for a token that suits better.
 
     Args:
-        goal: meters, in the frame of each agent.
-        num_left: decisions left, this one included.
-        class_id: agent class that each row's token ids refer to.
-        moves: displacement by each token, meters, in the agent's frame.
+        goal: Goal of each row, meters, in the frame of its agent.
+        num_left: Number of decisions left, the next included, from 1 to 16.
+        class_id: Agent class that each row's token ids refer to.
+        moves: Displacement by each token, meters, in the agent's frame.
     """
     features = goal.new_empty(len(goal), 3, moves.shape[1])
     left_s = (num_left[:, None] - 1).to(goal.dtype) * TOKEN_S  # [g, 1]
@@ -256,23 +252,24 @@ def suitability(
         x, y = move.unbind(-1)  # [V] or [r, V]
         speed = move.norm(dim=-1) / TOKEN_S
         (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]  # [r, 1]
-        rest = _length_in_place(goal_x - x, goal_y - y)  # [r, V] distance to the goal after the token
+        remaining = _write_length(goal_x - x, goal_y - y)  # [r, V] distance to the goal after the token
         reach = 1 + time_s / TOKEN_S
-        miss = _length_in_place(torch.addcmul(goal_x, reach, x, value=-1), torch.addcmul(goal_y, reach, y, value=-1))
-        progress = _length_in_place(goal_x.clone(), goal_y.clone()) - rest
-        pace = torch.addcmul(rest, time_s, speed, value=-1)
-        found = progress, _misfit_in_place(pace.div_(1 + time_s)), _misfit_in_place(miss.div_(1 + time_s))
-        features[rows] = torch.stack(found, dim=1)
+        miss = _write_length(torch.addcmul(goal_x, reach, x, value=-1), torch.addcmul(goal_y, reach, y, value=-1))
+        progress = _write_length(goal_x.clone(), goal_y.clone()) - remaining
+        pace = torch.addcmul(remaining, time_s, speed, value=-1)
+        # minus the absolute value of each misfit, without the corner at zero
+        misfits = [v.div_(1 + time_s).square_().add_(ROUNDING_MPS**2).sqrt_().neg_() for v in (pace, miss)]
+        features[rows] = torch.stack([progress, *misfits], dim=1)
     return features
 
 
 def _row_blocks(
     class_id: Int64[Tensor, "g"], moves: Float[Tensor, "C V 2"]
 ) -> Iterator[tuple[Int64[Tensor, "r"] | slice, Float[Tensor, "*r V 2"]]]:
-    """Yield some rows and the moves of their class: on the CPU class by class, elsewhere without looking at classes."""
+    """Blocks of rows, each with the moves of its class: on the CPU class by class, elsewhere in the order of rows."""
     if class_id.device.type == "cpu":
-        for own, move in enumerate(moves):
-            for rows in (class_id == own).nonzero()[:, 0].split(ROWS_PER_BLOCK):
+        for index, move in enumerate(moves):
+            for rows in (class_id == index).nonzero()[:, 0].split(ROWS_PER_BLOCK):
                 yield rows, move
         return
     for start in range(0, len(class_id), ROWS_PER_BLOCK_ELSEWHERE):
@@ -280,11 +277,6 @@ def _row_blocks(
         yield rows, moves[class_id[rows]]
 
 
-def _length_in_place(x: Tensor, y: Tensor) -> Tensor:
+def _write_length(x: Tensor, y: Tensor) -> Tensor:
     """Length of vectors, in the storage of x."""
     return x.square_().addcmul_(y, y).sqrt_()
-
-
-def _misfit_in_place(x: Float[Tensor, "r V"]) -> Float[Tensor, "r V"]:
-    """-sqrt(x^2 + ROUNDING_MPS^2): minus the absolute value without its corner at zero, in x's storage."""
-    return x.square_().add_(ROUNDING_MPS**2).sqrt_().neg_()

@@ -16,12 +16,12 @@ from rlftsim.tokens.vocabulary import CLASS_BOXES_M, box_of_class
 PERIODS = ((12.8, 0.05, 12), (3.2, 0.03, 10), (6.25, 0.06, 10))
 """Longest and shortest period and number of the frequencies of `ContinuationScores`: along and across the agent's
 heading in lengths of its class's box, and of its heading in radians."""
-ALONG = 0
+LONGITUDINAL_AXIS = 0
 """Axis along the heading."""
 
 
 class ClassHeads(nn.ModuleList):
-    """Features of R agents -> logits of the tokens of their own class, padded to V tokens."""
+    """Features of R agents -> logits of the tokens of each agent's class, padded to V tokens."""
 
     def __init__(self, dim: int, class_sizes: tuple[int, ...], num_tokens: int):
         super().__init__(MlpLayer(dim, dim, size) for size in class_sizes)
@@ -32,16 +32,16 @@ class ClassHeads(nn.ModuleList):
         """float32 logits; tokens that a class lacks get `NEVER`.
 
         Args:
-            features: of the agents.
-            class_id: of the agents.
+            features: Decoder features of each agent, a row per agent.
+            class_id: Class of each agent, an index into the heads; rows of padding classes are arbitrary.
         """
         logits = torch.full((len(features), self.num_tokens), NEVER, device=features.device)
         if features.device.type != "cpu":
             # each head sees all rows: to leave some out, the host would wait for their number
             for index, (head, size) in enumerate(zip(self, self.class_sizes)):
-                own = functional.pad(head(features).float(), (0, self.num_tokens - size), value=NEVER)
-                # those of padding, whose class has no head, are arbitrary
-                logits = torch.where((class_id >= index)[:, None], own, logits)
+                class_logits = functional.pad(head(features).float(), (0, self.num_tokens - size), value=NEVER)
+                # padding, whose class has no head, gets arbitrary logits
+                logits = torch.where((class_id >= index)[:, None], class_logits, logits)
             return logits
         for index, (head, size) in enumerate(zip(self, self.class_sizes)):
             # each head sees the rows of its class only
@@ -54,9 +54,9 @@ class ContinuationScores(nn.Module):
     """A second term of the logits: scores of tokens by how they change the agent's speed, and by where they turn.
 
     SMART's head has a free vector for each token and learns from every speed anew that agents mostly go on as they
-    went; speeds that few training scenarios have stay unknown, and agents fall back to those that are common. Here
-    token v is scored by how much farther its end m_v lies along the heading than that of the last token u did, and by
-    its end across the heading and its turn, which the road decides and not the last turn: a Fourier series
+    went; speeds that few training scenarios have stay unknown, and agents fall back to common speeds. Here token v is
+    scored by how much farther the end m_v lies along the heading than the end of the last token u, and by the end
+    across the heading and the turn, which the road decides and not the last turn: a Fourier series
 
         sum over frequencies w of  a_w cos(w d) + b_w sin(w d),
 
@@ -72,7 +72,7 @@ class ContinuationScores(nn.Module):
     def __init__(self, dim: int):
         super().__init__()
         spaced = [torch.logspace(-math.log10(longest), -math.log10(shortest), n) for longest, shortest, n in PERIODS]
-        axis = [torch.full_like(one, index, dtype=torch.int64) for index, one in enumerate(spaced)]
+        axis = [torch.full_like(values, index, dtype=torch.int64) for index, values in enumerate(spaced)]
         self.register_buffer("frequency", 2 * math.pi * torch.cat(spaced), persistent=False)
         self.register_buffer("axis", torch.cat(axis), persistent=False)
         self.query = nn.Linear(dim, 2 * len(self.frequency), bias=False)
@@ -81,31 +81,31 @@ class ContinuationScores(nn.Module):
         """Keys of all tokens; no weight takes part.
 
         Args:
-            ends: pose (x, y, heading) that each token leads to, meters and radians, in the agent's frame.
+            ends: Pose (x, y, heading) that each token leads to, meters and radians, in the agent's frame.
         """
         length, _ = box_of_class(torch.arange(len(ends), device=ends.device))
         unit = torch.stack([length, length, torch.ones_like(length)], -1)  # [C, 3]
         phase = (ends / unit[:, None])[..., self.axis] * self.frequency  # [C, V, F]
         return TokenKeys(
             keys=torch.cat([phase.cos(), phase.sin()], -1).transpose(0, 1).flatten(1),
-            phase_before=torch.where(self.axis == ALONG, phase, 0.0),
+            last_phase=torch.where(self.axis == LONGITUDINAL_AXIS, phase, 0.0),
         )
 
     def queries(
-        self, hidden: Float[Tensor, "R D"], phase_before: Float[Tensor, "R F"], class_id: Int64[Tensor, "R"]
+        self, hidden: Float[Tensor, "R D"], last_phase: Float[Tensor, "R F"], class_id: Int64[Tensor, "R"]
     ) -> Float[Tensor, "R CK"]:
-        """Queries for the keys of all classes side by side, zero at those of other classes, and for padding at all.
+        """Queries for the keys of all classes side by side: zero for keys of other classes, and all zero for padding.
 
         Args:
-            hidden: features that the last map of SMART's head reads.
-            phase_before: of the token that led to the current step, from `TokenKeys`.
-            class_id: of the agents.
+            hidden: Features that the last map of SMART's head reads, a row per agent.
+            last_phase: Phase of the token that led to the current step, from `TokenKeys`, radians.
+            class_id: Class of each agent, which selects the keys that its query applies to.
         """
         a, b = self.query(hidden).chunk(2, -1)  # [R, F]
-        cos, sin = phase_before.cos(), phase_before.sin()
+        cos, sin = last_phase.cos(), last_phase.sin()
         query = torch.cat([a * cos - b * sin, a * sin + b * cos], -1)
-        own = class_id[:, None] == torch.arange(len(CLASS_BOXES_M), device=class_id.device)
-        return (own[..., None] * query[:, None]).flatten(1)
+        is_class = class_id[:, None] == torch.arange(len(CLASS_BOXES_M), device=class_id.device)
+        return (is_class[..., None] * query[:, None]).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,5 +114,5 @@ class TokenKeys:
 
     keys: Float[Tensor, "V CK"]
     """Cosines and sines of the phases of a token, the classes side by side."""
-    phase_before: Float[Tensor, "C V F"]
+    last_phase: Float[Tensor, "C V F"]
     """Phase by which a token turns the query of the next decision: zero but along the heading."""

@@ -1,7 +1,7 @@
 """Weights and settings of a Lightning checkpoint, without running anything that the file holds.
 
-Such files are pickles. They are read through torch's restricted unpickler; the few foreign classes that hold
-settings (OmegaConf) are replaced by name with an inert stand-in, everything else is refused.
+Such files are pickles, read through torch's restricted unpickler. The few foreign classes that hold settings
+(OmegaConf) are replaced by name with an inert stand-in, all others are refused.
 """
 
 import collections
@@ -54,8 +54,8 @@ def read_lightning(path: Path) -> LightningFile:
     """Read weights and settings of a Lightning checkpoint.
 
     Raises:
-        CheckpointError: no such file, not a checkpoint, no weights in it, or objects inside that would have to run
-            code to be read.
+        CheckpointError: No such file, not a checkpoint, no weights inside, or objects that would have to run code to
+            be read.
     """
     content = _unpickle(path)
     weights = content.get("state_dict") if isinstance(content, dict) else None
@@ -68,8 +68,8 @@ def read_lightning(path: Path) -> LightningFile:
     return LightningFile(dict(weights), settings if isinstance(settings, dict) else {})
 
 
-def mapping_in(settings: dict[str, Any], name: str) -> dict[str, Any]:
-    """Group of settings by its name; empty where there is none."""
+def find_group(settings: dict[str, Any], name: str) -> dict[str, Any]:
+    """Group of settings of a name; empty where there is none."""
     group = settings.get(name)
     return group if isinstance(group, dict) else {}
 
@@ -81,35 +81,29 @@ def _is_weight(name: object, value: Any) -> bool:
     return value.device.type == "cpu" and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
-def _open_zip(path: Path) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
-        raise CheckpointError(f"{path}: damaged ({error}): get the file again.") from None
-
-
 def _unpickle(path: Path) -> Any:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file.")
     if not zipfile.is_zipfile(path):
         raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
     try:
-        with _open_zip(path) as archive:
+        with zipfile.ZipFile(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
                 raise CheckpointError(f"{path}: packed, which torch.save never does: unpack it, or get the file again.")
         # list the classes that the pickle names before any is made
         named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
-        unknown = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
-        if unknown:
-            raise CheckpointError(f"{path}: refused, it holds {', '.join(unknown)}: save it again with weights only.")
-        known = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
-        # then let torch's restricted unpickler make stand-ins for the known ones
-        with torch.serialization.safe_globals(list(known)):  # type: ignore[arg-type]
+        refused = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
+        if refused:
+            raise CheckpointError(f"{path}: refused, it holds {', '.join(refused)}: save it again with weights only.")
+        # then let torch's restricted unpickler make the harmless classes, and stand-ins for the foreign
+        classes: Any = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
+        with torch.serialization.safe_globals(classes):
             return torch.load(path, map_location="cpu", weights_only=True)
     except CheckpointError:
         raise
     except Exception as error:  # whatever damage makes of the code that reads it
-        raise CheckpointError(f"{path}: damaged or not a checkpoint ({first_line(error)}).") from None
+        reason = first_line(error)
+        raise CheckpointError(f"{path}: damaged or not a checkpoint ({reason}): get the file again.") from None
 
 
 def _plain(value: Any) -> Any:

@@ -23,14 +23,14 @@ from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import normalize
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
 from rlftsim.policies.smart.heads import ClassHeads
-from rlftsim.policies.smart.neighbors import most_within
-from rlftsim.policies.smart.network import Scene, SmartNetwork, nowhere_unless
-from rlftsim.policies.smart.token_steps import TokenSteps, logged_steps
+from rlftsim.policies.smart.neighbors import bound_neighbors
+from rlftsim.policies.smart.network import Scene, SmartNetwork, mask_positions
+from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
 from rlftsim.policies.token_rows import NEVER, TokenRows
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
-from rlftsim.tokens.map_tokens import MapTokens, tokenize_map
+from rlftsim.tokens.map_tokens import tokenize_map
 from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
 
 VOCABULARY = "vocabulary.safetensors"
@@ -42,7 +42,7 @@ Model = TypeVar("Model", bound="SmartModel")
 class SmartModel(nn.Module):
     """SMART's network and vocabulary; `SmartPolicy` adds the decisions.
 
-    The vocabulary is a value, not a weight: it is saved beside the weights and never trained.
+    The vocabulary is a value, not a weight: saved beside the weights and never trained.
     """
 
     architecture = "smart"
@@ -64,28 +64,28 @@ class SmartModel(nn.Module):
     # ---- training -------------------------------------------------------------------------------------------------
 
     def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
-        """The decoder's attention and head, as in the public CAT-K code, and everything for goals."""
-        return self.network.decoder.reading_parts()
+        """The decoder's attention and head, as in the public CAT-K code, and the goal modules."""
+        return self.network.decoder.reader_modules()
 
     def head_modules(self) -> tuple[nn.Module, ...]:
-        """The layers that turn an agent's features into logits of tokens, and everything for goals."""
+        """The layers that turn an agent's features into logits of tokens, and the goal modules."""
         return *self.network.decoder.head_modules(), *self.goal_modules()
 
     def goal_modules(self) -> tuple[nn.Module, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return self.network.decoder.goal_modules()
 
-    def sees_as(self, other: nn.Module) -> bool:
-        """True if scenes, and the relations of rows to them, are the same for another model, without gradient in both.
+    def sees_as(self, model: nn.Module) -> bool:
+        """True if scenes, and relations of rows to scenes, are the same for another model, without gradient in both.
 
-        So weights that they are made of are frozen in both models, and equal. The layers of the decoder, its head and
-        the goal parts may differ.
+        The weights that compute these are frozen in both models, and equal. The layers of the decoder, the head and the
+        goal modules may differ.
         """
-        if not isinstance(other, SmartModel) or self.training or other.training:
+        if not isinstance(model, SmartModel) or self.training or model.training:
             return False
-        if (self.config, self.vocabulary) != (other.config, other.vocabulary):
+        if (self.config, self.vocabulary) != (model.config, model.vocabulary):
             return False
-        return are_frozen_alike(self.network.seeing_weights(), other.network.seeing_weights())
+        return are_frozen_alike(self.network.scene_weights(), model.network.scene_weights())
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 
@@ -95,15 +95,15 @@ class SmartModel(nn.Module):
         return self.config.goal is not None
 
     def with_goal_conditioning(self: Model, encoding: GoalEncoding, *, logit_bias: bool | None = None) -> Model:
-        """Copy with goal-conditioning weights that have no effect yet; itself if it is conditioned in this way.
+        """Copy with goal-conditioning weights that have no effect yet; the model itself if conditioned in this way.
 
         Args:
-            encoding: of goals.
-            logit_bias: add a goal-progress bias to the token logits; False is the paper's model. None = yes for a
-                goal-free model, else as the model has it.
+            encoding: Encoding of goals, "concat" or "indication".
+            logit_bias: Whether a goal-progress bias is added to the token logits; False is the paper's model. None =
+                yes for a goal-free model, else as the model does.
 
         Raises:
-            ConfigError: it is conditioned in another way.
+            ConfigError: The model is conditioned in another way.
         """
         config = self.config.with_goal_conditioning(encoding, logit_bias)
         if config == self.config:
@@ -113,19 +113,16 @@ class SmartModel(nn.Module):
         decoder = policy.network.decoder
         if isinstance(decoder.goal, GoalEmbedding):
             decoder.goal.init_from(self.network.decoder.map_relation)
-        fresh = {
-            k: v for k, v in policy.network.state_dict().items() if k.startswith(("decoder.goal.", "decoder.aim."))
-        }
+        weights = policy.network.state_dict()
+        fresh = {name: weights[name] for name in weights if name.startswith(("decoder.goal.", "decoder.aim."))}
         load_strictly(policy.network, {**self.network.state_dict(), **fresh}, source="the model to start from")
         return policy.train(self.training)
 
     def with_guidance(self: Model, scale: float) -> Model:
-        """Copy whose goal logit bias is multiplied: above 1 goals are followed more closely than was learned.
-
-        Itself at 1.
+        """Copy with a scaled goal logit bias: above 1 goals are followed more closely than was learned; at 1 the model.
 
         Raises:
-            ConfigError: it has no goal logit bias, or `scale` is no number of 0 or more.
+            ConfigError: The model has no goal logit bias, or `scale` is no number of 0 or more.
         """
         if scale == 1.0:
             return self
@@ -136,9 +133,8 @@ class SmartModel(nn.Module):
                 f"guidance_scale={scale:g} has no effect: this model has no goal logit bias, leave it out."
             )
         policy = copy.deepcopy(self)
-        assert policy.network.decoder.aim is not None
         with torch.no_grad():
-            policy.network.decoder.aim.weight.mul_(scale)
+            policy.network.decoder.aim.weight.mul_(scale)  # type: ignore[union-attr]
         return policy
 
     # ---- files ----------------------------------------------------------------------------------------------------
@@ -147,8 +143,8 @@ class SmartModel(nn.Module):
         """Write config.json, model.safetensors, vocabulary.safetensors and README.md.
 
         Args:
-            folder: created where it is missing.
-            card: text of README.md.
+            folder: Folder of the model, created where it is missing.
+            card: Text of README.md, in Markdown; empty = a line that names no origin.
         """
         check_folder(Path(folder), "model")
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -161,9 +157,9 @@ class SmartModel(nn.Module):
         """Model of a model folder as `save_pretrained` writes it, or of a run's folder, in training mode.
 
         Raises:
-            ConfigError: there is no such folder, or its settings contradict each other.
-            CheckpointError: a missing or damaged file, another architecture, or keys and shapes that do not fit:
-                names the first.
+            ConfigError: There is no such folder, or the settings contradict each other.
+            CheckpointError: A missing or damaged file, another architecture, or keys and shapes that do not fit, the
+                first of which are named.
         """
         model = read_model(folder, architecture=cls.architecture)
         config, weights = model.build(SmartConfig), model.read_weights()
@@ -178,10 +174,15 @@ class SmartModel(nn.Module):
 
     # ---- parts of a forward pass ----------------------------------------------------------------------------------
 
-    def _scene(self, scenarios: ScenarioBatch) -> Scene:
+    def _build_scene(self, scenarios: ScenarioBatch) -> Scene:
         tokens = tokenize_map(scenarios, self.vocabulary.map_prototypes)
         class_id = class_of_type(scenarios.object_type)
         decoder = self.network.decoder
+        max_map_tokens = None
+        if self.config.max_agent_map_neighbors is None and tokens.position.device.type != "cpu":
+            # the host waits for the bound once, and not at every decision
+            candidates = mask_positions(tokens.token_mask, tokens.position)
+            max_map_tokens = bound_neighbors(candidates, self.config.agent_map_radius_m)
         return Scene(
             map_position=tokens.position,
             map_heading=tokens.heading,
@@ -192,20 +193,14 @@ class SmartModel(nn.Module):
             token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
             token_keys=None if decoder.scores is None else decoder.scores.keys(self.vocabulary.poses[:, :, -1]),
             relations=decoder.relations(),
-            most_map_tokens=self._most_map_tokens(tokens),
+            max_map_tokens=max_map_tokens,
         )
-
-    def _most_map_tokens(self, tokens: MapTokens) -> int | None:
-        """See `Scene.most_map_tokens`. Off the CPU the host waits for it once, and not at every decision."""
-        if self.config.max_agent_map_neighbors is not None or tokens.position.device.type == "cpu":
-            return None
-        return most_within(nowhere_unless(tokens.token_mask, tokens.position), self.config.agent_map_radius_m)
 
     def _tokenize(self, scenarios: ScenarioBatch) -> AgentTokens:
         return tokenize_agents(scenarios, self.vocabulary, catk_compat=self.config.catk_compat)
 
     def _logged_steps(self, tokens: AgentTokens, steps: slice) -> TokenSteps:
-        return logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
+        return build_logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
 
     def _predict(
         self,
@@ -215,8 +210,8 @@ class SmartModel(nn.Module):
         mask: Bool[Tensor, "B N A *L"],
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
-        place = find_rows(mask, is_dense=len(features) == mask.numel())
-        class_id = token_class[place[0], place[2]]  # [R]
+        scenario, _, agent, *_ = find_rows(mask, is_dense=len(features) == mask.numel())
+        class_id = token_class[scenario, agent]  # [R]
         head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):
             return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
@@ -226,7 +221,7 @@ class SmartModel(nn.Module):
         if scores is not None:
             assert scene.token_keys is not None
             # both terms of the logits in one product
-            phase_before = features[:, self.config.dim :]
-            hidden = torch.cat([hidden, scores.queries(hidden, phase_before, class_id)], -1)
+            last_phase = features[:, self.config.dim :]
+            hidden = torch.cat([hidden, scores.queries(hidden, last_phase, class_id)], -1)
             weight = torch.cat([weight, scene.token_keys.keys], -1)
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)

@@ -1,8 +1,7 @@
 """Neighbor search: padded lists of sources within a radius, and the geometry of each relation.
 
-R rows that attend, K neighbors of a row, P places with C candidates each. A list is padded with index 0 where its
-mask is False. A place is a scenario, or a scenario, rollout and step: rows attend to candidates of their own place
-only.
+R rows that attend, K neighbors of a row, P sets of C candidates each. Lists are padded where their mask is False. A
+set holds the candidates of a scenario, or of a scenario, rollout and step: a row has neighbors in a single set.
 """
 
 import math
@@ -22,10 +21,10 @@ PAIRS_PER_BLOCK = {"cpu": 1 << 18}
 """Distances that are computed together: on a processor they fit its cache."""
 PAIRS_PER_BLOCK_ELSEWHERE = 1 << 26
 WIDTH_STEP = 8
-"""Off the CPU widths of lists are multiples of it: fused attention wants masks that are aligned."""
+"""Off the CPU lists have a multiple of this width: fused attention wants aligned masks."""
 MANY_CANDIDATES, ROWS_PER_PATCH = 256, 64
-"""On a processor, rows that choose among so many candidates are sorted by where they are, and so many rows beside
-each other look only at what lies around them."""
+"""On a processor, rows that choose among so many candidates are sorted by position, and patches of so many rows are
+compared with the candidates around the patch alone."""
 MARGIN_M = 0.01
 """Added to the bounds of a patch, so that rounding excludes no candidate that is within the radius."""
 CELLS_PER_RADIUS, CELLS_PER_SIDE = 8, 256
@@ -48,7 +47,7 @@ class Poses:
     heading: Float[Tensor, "*shape"]
 
     def __getitem__(self, index: Any) -> "Poses":
-        """Poses at an index, as of the tensors."""
+        """Poses at an index, as for tensors."""
         return Poses(self.position[index], self.heading[index])
 
 
@@ -67,98 +66,77 @@ class RowGroups:
         return self.rows[torch.from_numpy(self.sizes.cumsum() - self.sizes)]
 
 
-def group_rows(place: Int64[Tensor, "R"], poses: Poses) -> RowGroups:
-    """Groups of rows whose place and pose are equal to the last bit; on the CPU.
+def group_rows(set_index: Int64[Tensor, "R"], poses: Poses) -> RowGroups:
+    """Groups of rows whose candidate set and pose are equal to the last bit; on the CPU.
 
     Args:
-        place: of the rows.
-        poses: [R].
+        set_index: Candidate set of each row, an index into the first axis of the candidates.
+        poses: Poses [R] of the rows, in the frame of the candidates.
     """
-    values = (place, *poses.position.unbind(-1), poses.heading)
+    values = (set_index, *poses.position.unbind(-1), poses.heading)
     keys = np.stack([v.numpy().view(f"i{v.itemsize}").astype(np.int64) for v in values])  # [4, R]
     order = np.lexsort(keys)
     starts = np.flatnonzero((np.diff(keys[:, order], prepend=-1) != 0).any(0) | (np.arange(len(order)) == 0))
     return RowGroups(torch.from_numpy(order), np.diff(starts, append=len(order)))
 
 
-def within(
+def find_neighbors(
     position: Float[Tensor, "R 2"],
-    place: Int64[Tensor, "R"],
+    set_index: Int64[Tensor, "R"],
     candidates: Float[Tensor, "P C 2"],
-    own: Int64[Tensor, "R"] | None,
+    self_index: Int64[Tensor, "R"] | None,
     *,
     radius_m: float,
     limit: int | None,
-    most: int | None = None,
+    max_neighbors: int | None = None,
 ) -> Neighbors:
     """Candidates nearer than a radius (strictly), or the nearest of them where a limit binds.
 
-    Of equally near ones the first counts. Lists have at least one entry (K >= 1), padding where no row has a neighbor.
+    Of equally near candidates the first counts. Lists have at least one entry (K >= 1), padding where no row has a
+    neighbor.
 
     Args:
-        position: of the rows, finite.
-        place: the place of each row, an entry of the candidates' first axis.
-        candidates: positions, infinite for padding. Neighbors are named by their flat index p * C + c.
-        own: the candidate of its place that is the row itself, and is no neighbor; None = rows are no candidates.
-        radius_m: of the circle around a row.
-        limit: most neighbors of a row; None = all.
-        most: no row has more candidates within the radius, see `most_within`. Off the CPU lists are then as wide, and
-            the host need not wait for their width.
+        position: Finite positions of the rows, meters, in the frame of the candidates.
+        set_index: Candidate set of each row, an index into the first axis of the candidates.
+        candidates: Positions, meters, infinite for padding. Neighbors are named by their flat index p * C + c.
+        self_index: Candidate of the set that is the row itself, and no neighbor; None = no row is a candidate.
+        radius_m: Radius of the circle around a row in which neighbors lie, meters.
+        limit: Largest number of neighbors of a row, the nearest of them; None = all within the radius.
+        max_neighbors: Bound on the candidates within the radius of a row, see `bound_neighbors`. Off the CPU lists are
+            then as wide, and the host need not wait for their width.
     """
-    if position.device.type != "cpu":
-        return _within_fixed(position, place, candidates, own, radius_m, limit, most)
-    _, num_candidates, _ = candidates.shape
-    cut = _patches if num_candidates >= MANY_CANDIDATES else _blocks
-    found = []
-    for view in cut(position, place, candidates, radius_m):
-        squared = _squared_distances(view, position, own)
-        near = _all_near(squared, radius_m) if limit is None else _nearest(squared, radius_m, limit)
-        found.append((view.rows, view.columns[near.index] if len(view.columns) else near.index, near.mask))
-    # lists of all views, padded to the longest [R, K]
-    width = max([1, *(mask.shape[1] for _, _, mask in found)])
-    index, is_near = place.new_zeros(len(place), width), place.new_zeros(len(place), width, dtype=torch.bool)
-    for rows, columns, mask in found:
-        index[:, : mask.shape[1]].index_copy_(0, rows, columns.masked_fill_(~mask, 0))
-        is_near[:, : mask.shape[1]].index_copy_(0, rows, mask)
-    return Neighbors(index + place[:, None] * num_candidates, is_near)
-
-
-def _within_fixed(
-    position: Float[Tensor, "R 2"],
-    place: Int64[Tensor, "R"],
-    candidates: Float[Tensor, "P C 2"],
-    own: Int64[Tensor, "R"] | None,
-    radius_m: float,
-    limit: int | None,
-    most: int | None,
-) -> Neighbors:
-    """`within` in lists of a width that depends on no position, if `limit` or `most` is given."""
-    found = []
-    for view in _blocks(position, place, candidates, radius_m):
-        squared = _squared_distances(view, position, own)
+    num_candidates, is_on_cpu = candidates.shape[1], position.device.type == "cpu"
+    cut = _patches if is_on_cpu and num_candidates >= MANY_CANDIDATES else _blocks
+    lists = []
+    for view in cut(position, set_index, candidates, radius_m):
+        squared = _squared_distances(view, position, self_index)
         if limit is not None:
-            near = _nearest(squared, radius_m, limit)
+            neighbors = _select_nearest(squared, radius_m, limit)
+        elif is_on_cpu:
+            neighbors = _select_within(squared, radius_m)
         else:
-            near = _first_near(squared, radius_m, most)
-        found.append((near.index, near.mask))
-    index, mask = (torch.cat(values) for values in zip(*found))
-    index = index.masked_fill(~mask, 0) + place[:, None] * candidates.shape[1]
-    padding = (0, -mask.shape[1] % WIDTH_STEP)
-    return (
-        Neighbors(functional.pad(index, padding), functional.pad(mask, padding))
-        if padding[1]
-        else Neighbors(index, mask)
-    )
+            neighbors = _select_bounded(squared, radius_m, max_neighbors)
+        columns = view.columns[neighbors.index] if len(view.columns) else neighbors.index
+        lists.append((view.rows, columns.masked_fill(~neighbors.mask, 0), neighbors.mask))
+    # lists of all views, padded to the longest [R, K]
+    width = max([1, *(mask.shape[1] for _, _, mask in lists)])
+    width += 0 if is_on_cpu else -width % WIDTH_STEP
+    index = set_index.new_zeros(len(set_index), width)
+    is_neighbor = torch.zeros_like(index, dtype=torch.bool)
+    for rows, columns, mask in lists:
+        index[:, : mask.shape[1]].index_copy_(0, rows, columns)
+        is_neighbor[:, : mask.shape[1]].index_copy_(0, rows, mask)
+    return Neighbors(index + set_index[:, None] * num_candidates, is_neighbor)
 
 
-def most_within(candidates: Float[Tensor, "P C 2"], radius_m: float) -> int:
-    """A number that no point has more candidates of a place than within the radius: the most in a disc of cells.
+def bound_neighbors(candidates: Float[Tensor, "P C 2"], radius_m: float) -> int:
+    """Bound on the candidates of a set that lie within a radius of any point: the most in a disc of cells.
 
-    It exceeds the largest number by about a third, where candidates lie everywhere.
+    The bound exceeds the largest number by about a third, where candidates lie everywhere.
 
     Args:
-        candidates: positions, infinite for padding.
-        radius_m: of the circle around a point.
+        candidates: Positions, meters, infinite for padding.
+        radius_m: Radius of the circle around a point, meters.
     """
     # 1. Candidates of each cell. Cells repeat after CELLS_PER_SIDE, which can only raise a sum.
     cell_m = radius_m / CELLS_PER_RADIUS
@@ -167,10 +145,10 @@ def most_within(candidates: Float[Tensor, "P C 2"], radius_m: float) -> int:
     counts = candidates.new_zeros(len(candidates), CELLS_PER_SIDE**2)
     counts.scatter_add_(1, cell[..., 0] * CELLS_PER_SIDE + cell[..., 1], exists.to(counts.dtype))
     # 2. Sums over the cells that the circle around a point of the middle one may touch.
-    farthest, reach = CELLS_PER_RADIUS + 1, CELLS_PER_RADIUS * (1 + MARGIN_M / radius_m)
-    gap = (torch.arange(-farthest, farthest + 1, device=counts.device).abs() - 1).clamp(min=0)  # in cells, between two
+    max_offset, reach = CELLS_PER_RADIUS + 1, CELLS_PER_RADIUS * (1 + MARGIN_M / radius_m)
+    gap = (torch.arange(-max_offset, max_offset + 1, device=counts.device).abs() - 1).clamp(min=0)  # in cells
     disc = (gap[:, None].square() + gap.square() < reach**2).to(counts.dtype)
-    padded = functional.pad(counts.view(-1, 1, CELLS_PER_SIDE, CELLS_PER_SIDE), (farthest,) * 4, mode="circular")
+    padded = functional.pad(counts.view(-1, 1, CELLS_PER_SIDE, CELLS_PER_SIDE), (max_offset,) * 4, mode="circular")
     return int(functional.conv2d(padded, disc[None, None]).max())
 
 
@@ -185,55 +163,55 @@ class View:
 
 
 def _squared_distances(
-    view: View, position: Float[Tensor, "R 2"], own: Int64[Tensor, "R"] | None
+    view: View, position: Float[Tensor, "R 2"], self_index: Int64[Tensor, "R"] | None
 ) -> Float[Tensor, "r c"]:
-    """Squared distances of a view's rows to its candidates, infinite to a row's own."""
+    """Squared distances between rows and candidates of a view, infinite from a row to itself."""
     # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
     squared = (view.x - position[view.rows, :1]).square_()
     squared += (view.y - position[view.rows, 1:]).square_()
-    if own is not None:
-        squared.masked_fill_(view.columns == own[view.rows, None], torch.inf)
+    if self_index is not None:
+        squared.masked_fill_(view.columns == self_index[view.rows, None], torch.inf)
     return squared
 
 
 def _blocks(
-    position: Float[Tensor, "R 2"], place: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
+    position: Float[Tensor, "R 2"], set_index: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
 ) -> Iterator[View]:
-    """Views of all candidates of each row's place."""
-    columns = torch.arange(candidates.shape[1], device=place.device)
+    """Views of all candidates in the sets of the rows."""
+    columns = torch.arange(candidates.shape[1], device=set_index.device)
     x, y = candidates[..., 0].contiguous(), candidates[..., 1].contiguous()
-    pairs = PAIRS_PER_BLOCK.get(place.device.type, PAIRS_PER_BLOCK_ELSEWHERE)
-    for rows in torch.arange(len(place), device=place.device).split(max(pairs // max(len(columns), 1), 1)):
-        yield View(rows, columns, x.index_select(0, place[rows]), y.index_select(0, place[rows]))
+    pairs = PAIRS_PER_BLOCK.get(set_index.device.type, PAIRS_PER_BLOCK_ELSEWHERE)
+    for rows in torch.arange(len(set_index), device=set_index.device).split(max(pairs // max(len(columns), 1), 1)):
+        yield View(rows, columns, x.index_select(0, set_index[rows]), y.index_select(0, set_index[rows]))
 
 
 def _patches(
-    position: Float[Tensor, "R 2"], place: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
+    position: Float[Tensor, "R 2"], set_index: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
 ) -> Iterator[View]:
-    """Views of rows that lie beside each other in the same place, and the candidates around them.
+    """Views of adjacent rows with the same candidate set, and the candidates around these rows.
 
     A row's circle is much smaller than a map, so most candidates need no distance.
     """
-    # 1. order rows by place, then by square of a grid as wide as the circle
+    # 1. order rows by candidate set, then by square of a grid as wide as the circle
     squares = (position / (2 * radius_m)).floor()
-    order = np.lexsort((squares[:, 0].numpy(), squares[:, 1].numpy(), place.numpy()))
-    starts = np.flatnonzero(np.diff(place.numpy()[order], prepend=-1))
+    order = np.lexsort((squares[:, 0].numpy(), squares[:, 1].numpy(), set_index.numpy()))
+    starts = np.flatnonzero(np.diff(set_index.numpy()[order], prepend=-1))
     # 2. some rows in this order at a time, and the candidates in their bounding box plus the radius
     for rows in np.split(order, starts[1:]) if len(order) else ():
-        x, y = candidates[place[rows[0]]].unbind(-1)
+        x, y = candidates[set_index[rows[0]]].unbind(-1)
         for patch in torch.from_numpy(rows).split(ROWS_PER_PATCH):
             (left, bottom), (right, top) = torch.aminmax(position[patch], dim=0)
             reach = radius_m + MARGIN_M
-            is_around = (x > left - reach) & (x < right + reach) & (y > bottom - reach) & (y < top + reach)
-            columns = is_around.nonzero()[:, 0]
+            is_in_box = (x > left - reach) & (x < right + reach) & (y > bottom - reach) & (y < top + reach)
+            columns = is_in_box.nonzero()[:, 0]
             yield View(patch, columns, x[None, columns], y[None, columns])
 
 
-def _nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) -> Neighbors:
-    """The `limit` nearest candidates, of equally near ones the first.
+def _select_nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) -> Neighbors:
+    """The `limit` nearest candidates, of equally near candidates the first.
 
-    `topk` of the distances themselves takes any of equally near ones, depending on how many candidates there are,
-    padding included.
+    `topk` of the distances alone takes any of equally near candidates, depending on the number of all, padding
+    included.
     """
     columns = torch.arange(squared.shape[1], device=squared.device)
     # distance in the upper 32 bits, column in the lower: floats that are not negative sort as their bits do
@@ -242,43 +220,42 @@ def _nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) -> Neig
     return Neighbors(index, squared.gather(1, index) < radius_m**2)
 
 
-def _all_near(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
+def _select_within(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
     """All candidates within the radius, in the order of their columns."""
-    near = squared < radius_m**2
-    count = near.sum(-1, keepdim=True)
-    column = near.nonzero()[:, 1]  # of all rows, one row after the other
-    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=near.device)
+    is_near = squared < radius_m**2
+    count = is_near.sum(-1, keepdim=True)
+    column = is_near.nonzero()[:, 1]  # of all rows, one row after the other
+    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=is_near.device)
     mask = columns < count
-    # place of each list's entries among these; padding repeats any
+    # position of each list's entries among these; padding repeats any
     entry = (count.cumsum(0) - count + columns).clamp(max=max(len(column) - 1, 0))
-    index = column[entry] if len(column) else torch.zeros_like(entry)
-    return Neighbors(index.masked_fill_(~mask, 0), mask)
+    return Neighbors(column[entry] if len(column) else torch.zeros_like(entry), mask)
 
 
-def _first_near(squared: Float[Tensor, "r C"], radius_m: float, most: int | None) -> Neighbors:
-    """As `_all_near`, in lists of `most` entries; the host waits only where that is not known."""
-    near = squared < radius_m**2
-    columns = torch.arange(squared.shape[1], device=near.device).expand(near.shape)
-    most = int(near.sum(-1).max()) if most is None else most
-    if most >= squared.shape[1]:
-        return Neighbors(columns, near)
-    place = near.cumsum(-1)
+def _select_bounded(squared: Float[Tensor, "r C"], radius_m: float, max_neighbors: int | None) -> Neighbors:
+    """As `_select_within`, in lists of `max_neighbors` entries; without that bound the host waits for the count."""
+    is_near = squared < radius_m**2
+    columns = torch.arange(squared.shape[1], device=is_near.device).expand(is_near.shape)
+    width = int(is_near.sum(-1).max()) if max_neighbors is None else max_neighbors
+    if width >= squared.shape[1]:
+        return Neighbors(columns, is_near)
+    count = is_near.cumsum(-1)
     # the first neighbor goes to the first entry, and so on; all others to one more entry, which is cut off
-    index = columns.new_zeros(len(near), most + 1)
-    index.scatter_(1, torch.where(near, place - 1, most), columns)
-    return Neighbors(index[:, :most], columns[:, :most] < place[:, -1:])
+    index = columns.new_zeros(len(is_near), width + 1)
+    index.scatter_(1, torch.where(is_near, count - 1, width), columns)
+    return Neighbors(index[:, :width], columns[:, :width] < count[:, -1:])
 
 
-def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:
+def relative_pose(row: Poses, neighbor: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:
     """Distance, bearing in the row's frame, and difference of heading, of each row's neighbors.
 
     Args:
-        row: poses [R].
-        other: poses of the neighbors [R, K].
-        seam_rad: angles lie in [seam_rad - pi, seam_rad + pi), see `SmartConfig.seam_rad`.
+        row: Poses [R] of the rows, which become the origin of the relation.
+        neighbor: Poses [R, K] of the neighbors, in the same frame as the rows.
+        seam_rad: Width of the seam: angles lie in [seam_rad - pi, seam_rad + pi), see `SmartConfig.seam_rad`.
     """
-    offset = other.position - row.position[:, None]
+    offset = neighbor.position - row.position[:, None]
     bearing = angle_between(heading_vector(row.heading)[:, None].expand_as(offset), offset)
-    angles = torch.stack([bearing, wrap_angle(other.heading - row.heading[:, None])], -1)
+    angles = torch.stack([bearing, wrap_angle(neighbor.heading - row.heading[:, None])], -1)
     angles = torch.where(angles < seam_rad - math.pi, angles + 2 * math.pi, angles)
     return torch.cat([offset.norm(dim=-1, keepdim=True), angles], -1)

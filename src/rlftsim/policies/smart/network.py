@@ -1,16 +1,15 @@
 """The network of SMART: a map encoder, and a decoder over agents and token steps.
 
 B scenarios, N rollouts, A agents, K token steps of a block, P of the past, M map tokens, D width, C classes, V
-tokens. Everything that attends is a *row*: one valid (scenario, rollout, agent, step), flattened, R in all. The
-decoder works on a block of steps given the past. So the history (once per scenario), a single step of a rollout and
-all steps of a scoring pass go through the same code.
+tokens. What attends is a *row*: a valid (scenario, rollout, agent, step), flattened, R in all. The decoder works on a
+block of steps given the past. So the history (once per scenario), a single step of a rollout and all steps of a scoring
+pass go through the same code.
 
 In closed loop off the CPU all elements of a block are rows, padding too. Then no shape depends on a value: the host
 never waits inside a decision, and all decisions of a rollout are one CUDA graph.
 """
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -43,18 +42,18 @@ from rlftsim.policies.smart.goal_conditioning import (
     GoalEdgeEmbedding,
     GoalEmbedding,
     GoalLogitBias,
-    goal_encoder,
-    rows_where,
+    build_goal_encoder,
+    select_rows,
 )
 from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
-from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
+from rlftsim.policies.smart.neighbors import Poses, find_neighbors, group_rows, relative_pose
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import find_rows, place_rows
 from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
 MAX_LOOK_BACK_M = 160.0
-"""Largest distance between an agent and its remembered positions (3 s at 50 m/s), for tables."""
+"""Largest distance between an agent and the remembered positions (3 s at 50 m/s), for tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +64,21 @@ class Scene:
     map_heading: Float[Tensor, "B M"]
     map_mask: Bool[Tensor, "B M"]
     map_features: Float[Tensor, "BM D"]
-    """Normalized features of all map tokens, scenarios one after the other."""
+    """Normalized features of all map tokens, scenario after scenario."""
     class_id: Int64[Tensor, "B A"]
     agent_features: Float[Tensor, "B A D"]
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
     relations: "Relations"
-    most_map_tokens: int | None = None
-    """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
+    max_map_tokens: int | None = None
+    """No agent has more map tokens within reach, in any position. None on the CPU, which counts at every step."""
     token_keys: TokenKeys | None = None
     """For `ContinuationScores`; None = the head has none."""
 
     @property
     def map_poses(self) -> Poses:
-        """Poses [B M] of all map tokens, scenarios one after the other."""
+        """Poses [B M] of all map tokens, scenario after scenario."""
         return Poses(self.map_position.flatten(0, 1), self.map_heading.flatten())
 
 
@@ -103,12 +102,12 @@ class Past:
     sources: tuple[Float[Tensor, "S D"], ...]
     """Normalized inputs of each layer's attention over time."""
 
-    def then(self, steps: TokenSteps, row: Int64[Tensor, "B N A K"]) -> "Past":
-        """The past with a block's poses appended; its sources are still those of the past.
+    def append(self, steps: TokenSteps, row: Int64[Tensor, "B N A K"]) -> "Past":
+        """The past with a block's poses appended, and the sources unchanged.
 
         Args:
-            steps: the block.
-            row: of `sources`, where the block's features will be.
+            steps: Block of steps that follows the past.
+            row: Row of `sources` that the block's features will have, -1 where there is none.
         """
         return Past(
             torch.cat([self.position, steps.position], 3),
@@ -118,13 +117,14 @@ class Past:
         )
 
     def repeat(self, num_rollouts: int) -> "Past":
-        """The past of a single rollout, shared by N of them."""
-        shapes = ((v, (-1, num_rollouts, *v.shape[2:])) for v in (self.position, self.heading, self.row))
-        position, heading, row = (v.expand(shape) for v, shape in shapes)
+        """The past of a single rollout, shared by N rollouts."""
+        position, heading, row = (
+            value.expand(-1, num_rollouts, *value.shape[2:]) for value in (self.position, self.heading, self.row)
+        )
         return Past(position, heading, row, self.sources)
 
     def without_last_step(self) -> "Past":
-        """The past before its last step. Rows of the sources that are no longer referred to stay."""
+        """The past before the last step. Rows of the sources that are no longer referred to stay."""
         return Past(self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1], self.sources)
 
     def last(self, num_steps: int) -> "Past":
@@ -132,14 +132,14 @@ class Past:
 
         So a past that grows at every decision keeps its shapes.
         """
-        ahead = num_steps - self.row.shape[-1]  # steps to add in front, or minus those to drop
-        row = functional.pad(self.row, (ahead, 0), value=-1)
-        kept = row.flatten().clamp(min=0)
+        num_added = num_steps - self.row.shape[-1]  # steps to add in front, or minus those to drop
+        row = functional.pad(self.row, (num_added, 0), value=-1)
+        selected = row.flatten().clamp(min=0)
         return Past(
-            functional.pad(self.position, (0, 0, ahead, 0)),
-            functional.pad(self.heading, (ahead, 0)),
-            torch.where(row >= 0, torch.arange(len(kept), device=row.device).view_as(row), -1),
-            tuple(source.index_select(0, kept) for source in self.sources),
+            functional.pad(self.position, (0, 0, num_added, 0)),
+            functional.pad(self.heading, (num_added, 0)),
+            torch.where(row >= 0, torch.arange(len(selected), device=row.device).view_as(row), -1),
+            tuple(source.index_select(0, selected) for source in self.sources),
         )
 
 
@@ -153,7 +153,8 @@ class View:
     """Poses [R]."""
     past: Past
     """Poses and rows of the past, followed by the block; no sources."""
-    own_history: Neighborhoods
+    history: Neighborhoods
+    """Earlier steps of the same agent."""
     map_tokens: Neighborhoods
     agents: Neighborhoods
 
@@ -176,40 +177,40 @@ class MapEncoder(nn.Module):
         )
 
     def forward(self, tokens: MapTokens, prototypes: Float[Tensor, "P 11 2"]) -> Float[Tensor, "BM D"]:
-        """Features of all map tokens, scenarios one after the other. Padding has arbitrary finite features.
+        """Features of all map tokens, scenario after scenario. Padding has arbitrary finite features.
 
         Args:
-            tokens: of the scenarios [B, M].
-            prototypes: points of each prototype, its own frame, meters.
+            tokens: Map tokens [B, M] of the scenarios, map frame.
+            prototypes: Points of each prototype, meters, in the frame of the prototype.
         """
         x = self.token(prototypes.flatten(1))[tokens.token_id]  # [B, M, D]
-        # categories are added to the shape's embedding: lane or edge, kind of piece, state of its light
+        # categories are added to the shape's embedding: lane or edge, family, state of the light
         x = x + self.feature_type(tokens.type) + self.kind(tokens.family) + self.light(tokens.light)
         x = x.flatten(0, 1)
-        # 1. rows: the tokens that are no padding; each attends to tokens of its own scenario within reach
+        # 1. rows: the tokens that are no padding; each attends to tokens of the same scenario within reach
         rows = tokens.token_mask.flatten().nonzero()[:, 0]
         poses = Poses(tokens.position.flatten(0, 1), tokens.heading.flatten())
         width = tokens.token_mask.shape[1]
-        neighbors = within(
-            poses.position[rows], rows // width, nowhere_unless(tokens.token_mask, tokens.position), rows % width,
+        neighbors = find_neighbors(
+            poses.position[rows], rows // width, mask_positions(tokens.token_mask, tokens.position), rows % width,
             radius_m=self.config.map_radius_m, limit=self.config.max_map_neighbors,
         )  # fmt: skip
         embedding = tabulate(self.relation, self.config.map_radius_m)
         values = relative_pose(poses[rows], poses[neighbors.index], seam_rad=self.config.seam_rad)  # [R, K, 3]
-        around = build_neighborhoods(embedding, values, neighbors.index, neighbors.mask, dim=self.config.dim)
-        # 2. layers: sources are all tokens, as neighbors are named by their place among all
+        neighborhoods = build_neighborhoods(embedding, values, neighbors.index, neighbors.mask, dim=self.config.dim)
+        # 2. layers: sources are all tokens, as neighbors are named by the index among all
         updated = x[rows]
         for layer in self.layers:
-            updated = layer(updated, x.index_copy(0, rows, normalize(updated)), around)
+            updated = layer(updated, x.index_copy(0, rows, normalize(updated)), neighborhoods)
         return x.index_copy(0, rows, updated)
 
 
-def nowhere_unless(mask: Bool[Tensor, "*shape"], position: Float[Tensor, "*shape 2"]) -> Float[Tensor, "*shape 2"]:
-    """Positions, infinite where the mask is False, so that they are near to nothing.
+def mask_positions(mask: Bool[Tensor, "*shape"], position: Float[Tensor, "*shape 2"]) -> Float[Tensor, "*shape 2"]:
+    """Positions, infinite where the mask is False, so that these are within no radius.
 
     Args:
-        mask: True = the position is kept.
-        position: any.
+        mask: True = the position stays as it is, False = padding.
+        position: Positions in any frame, meters; those of padding are not read.
     """
     return position.masked_fill(~mask[..., None], torch.inf)
 
@@ -237,12 +238,12 @@ class AgentDecoder(nn.Module):
         self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
         self.scores = ContinuationScores(dim) if config.continuation_scores else None
         # the names `goal` and `aim` are keys of stored weights
-        self.goal = goal_encoder(config.goal, dim, frequencies)
+        self.goal = build_goal_encoder(config.goal, dim, frequencies)
         self.aim = GoalLogitBias() if config.goal_logit_bias else None
 
     def goal_modules(self) -> tuple[GoalEmbedding | GoalEdgeEmbedding | GoalLogitBias, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
-        return tuple(part for part in (self.goal, self.aim) if part is not None)
+        return tuple(module for module in (self.goal, self.aim) if module is not None)
 
     def relations(self) -> Relations:
         """The relation embeddings, tabulated unless a gradient has to be exact."""
@@ -258,8 +259,8 @@ class AgentDecoder(nn.Module):
         """Embedding of class and size.
 
         Args:
-            class_id: of the agents.
-            size: length, width, height, meters.
+            class_id: Class of each agent: vehicle, pedestrian, cyclist or padding.
+            size: Length, width and height of each agent, meters.
         """
         return self.class_embedding(class_id) + self.size(size)
 
@@ -268,11 +269,11 @@ class AgentDecoder(nn.Module):
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
 
     def head_modules(self) -> tuple[nn.Module, ...]:
-        """The parts that turn features into logits."""
+        """The modules that turn features into logits."""
         return (self.head,) if self.scores is None else (self.head, self.scores)
 
-    def reading_parts(self) -> tuple[nn.Module, ...]:
-        """Layers, head and goal parts: all that scenes and views are not made of."""
+    def reader_modules(self) -> tuple[nn.Module, ...]:
+        """Layers, head and goal modules, whose weights do not enter scenes and views."""
         return self.time_layers, self.map_layers, self.agent_layers, *self.head_modules(), *self.goal_modules()
 
     def fold(self) -> tuple[AttentionMaps, ...]:
@@ -289,48 +290,54 @@ class AgentDecoder(nn.Module):
         *,
         padded: bool = False,
     ) -> View:
-        """The rows of a block and everything around them, which the layers only read.
+        """The rows of a block and their neighbors, which the layers only read.
 
-        No weight of a layer takes part, so where the other weights are frozen and equal two models share it.
+        No weight of a layer takes part, so two models share the view where the other weights are frozen and equal.
 
         Args:
-            scene: map and agents.
-            steps: the block.
-            past: of earlier blocks; None = the block begins the scenario.
-            hidden: True = the pair takes no part in the attention over time.
-            padded: padding has rows, too, which nothing attends to, and lists of neighbors have fixed widths.
+            scene: Map, agents and embeddings of relations, in the frame of the steps.
+            steps: Block of steps whose valid elements become rows.
+            past: Past of earlier blocks; None = the block begins the scenario.
+            hidden: True = the (agent, step) pair takes no part in the attention over time.
+            padded: Whether padding has rows, too, which no row attends to, and lists have fixed widths.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
-        rows = find_rows(steps.valid, padded)
-        first_row = 0 if past is None else past.sources[0].shape[0]
-        index = torch.arange(len(rows[0]), device=steps.valid.device)
-        row_of = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]
-        new_row = torch.where(row_of >= 0, row_of + first_row, -1)
-        new_past = Past(steps.position, steps.heading, new_row, ()) if past is None else past.then(steps, new_row)
-        # 2. their neighbors, which all layers share
+        rows = scenario, rollout, agent, step = find_rows(steps.valid, padded)
+        num_sources = 0 if past is None else past.sources[0].shape[0]
+        index = torch.arange(len(agent), device=agent.device)
+        element_row = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]
+        source_row = torch.where(element_row >= 0, element_row + num_sources, -1)
+        past = Past(steps.position, steps.heading, source_row, ()) if past is None else past.append(steps, source_row)
         poses = Poses(steps.position, steps.heading)[rows]
-        # Agents that stand are at the same pose in many steps and rollouts. In training every row has a dropout mask of
-        # its own; and a device would have to be waited for.
-        is_shared = not (padded or self.training) and row_of.device.type == "cpu"
-        groups = group_rows(rows[0], poses) if is_shared else None
-        first = slice(None) if groups is None else groups.first
-        near_map = within(
-            poses.position[first], rows[0][first], nowhere_unless(scene.map_mask, scene.map_position), None,
-            radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
-            most=scene.most_map_tokens,
-        )  # fmt: skip
-        map_relation = self._relative(poses[first], scene.map_poses, near_map)
         build = partial(build_neighborhoods, dim=self.config.dim, padded=padded)
+        # 2. map tokens. Agents that stand are at the same pose in many steps and rollouts, and share a list. But in
+        # training every row has a dropout mask; and a device would have to be waited for
+        is_shared = not (padded or self.training) and agent.device.type == "cpu"
+        groups = group_rows(scenario, poses) if is_shared else None
+        first = slice(None) if groups is None else groups.first
+        tokens = find_neighbors(
+            poses.position[first], scenario[first], mask_positions(scene.map_mask, scene.map_position), None,
+            radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
+            max_neighbors=scene.max_map_tokens,
+        )  # fmt: skip
+        map_relation = relative_pose(poses[first], scene.map_poses[tokens.index], seam_rad=self.config.seam_rad)
+        # 3. agents: the candidates of a row are the agents of the same scenario, rollout and step
+        candidates = mask_positions(steps.valid, steps.position).transpose(2, 3)  # [B, N, K, A, 2]
+        _, num_rollouts, num_steps, num_agents, _ = candidates.shape
+        agents = find_neighbors(
+            poses.position, (scenario * num_rollouts + rollout) * num_steps + step, candidates.flatten(0, 2), agent,
+            radius_m=self.config.agent_radius_m, limit=self.config.max_agent_neighbors, max_neighbors=num_agents,
+        )  # fmt: skip
+        # from candidates to rows; padding is clamped to any row, its mask is False
+        agent_row = element_row.transpose(2, 3).flatten()[agents.index].clamp(min=0)
+        agent_relation = relative_pose(poses, poses[agent_row], seam_rad=self.config.seam_rad)
         return View(
-            rows=rows,
-            poses=poses,
-            past=new_past,
-            own_history=self._own_history(scene, new_past, steps, rows, poses, hidden, build),
+            rows, poses, past,
+            history=build(scene.relations.time, *self._find_history(past, steps, rows, poses, hidden)),
             map_tokens=build(
-                scene.relations.map, map_relation, near_map.index, near_map.mask, features=scene.map_features,
-                groups=groups,
+                scene.relations.map, map_relation, tokens.index, tokens.mask, features=scene.map_features, groups=groups
             ),
-            agents=self._agent_neighbors(scene, steps, rows, poses, row_of, build),
+            agents=build(scene.relations.agent, agent_relation, agent_row, agents.mask),
         )  # fmt: skip
 
     def forward(
@@ -345,11 +352,11 @@ class AgentDecoder(nn.Module):
         """Features of the valid (agent, step) pairs of a block, and the new past.
 
         Args:
-            scene: map and agents.
-            steps: the block.
-            past: of earlier blocks; None = the block begins the scenario.
-            view: of the block, if it has been looked at already.
-            goals: of all agents; None = all agents are goal-free.
+            scene: Map, agents and embeddings of relations, in the frame of the steps.
+            steps: Block of steps to decide after.
+            past: Past of earlier blocks; None = the block begins the scenario.
+            view: Result of `look` for the block; None = looked at here.
+            goals: Goals [B, N, A] of all agents; None = all agents are goal-free.
             maps: `fold()` of weights that get no gradient, computed once for many blocks.
 
         Returns:
@@ -357,120 +364,86 @@ class AgentDecoder(nn.Module):
             token that led to the step (E = D + F); and the past, followed by the block.
         """
         view = self.look(scene, steps, past) if view is None else view
-        x = self._embed_steps(scene, steps, view.rows, view.poses, goals)
-        goal_edges = self._goal_edges(scene, view.rows, view.poses, goals)
-        # inputs of the attention over time are kept: later blocks attend to them
+        x = self._embed_steps(scene, steps, view, goals)
+        goal_edges = self._build_goal_edges(scene, view, goals)
+        # inputs of the attention over time are stored: later blocks attend to them
         sources, folded = [], itertools.repeat(None) if maps is None else iter(maps)
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
             time_layer, map_layer, agent_layer = layers
-            own = normalize(x)
-            source = own if past is None else torch.cat([past.sources[index], own])
+            source = normalize(x)
+            source = source if past is None else torch.cat([past.sources[index], source])
             sources.append(source)
-            x = time_layer(x, source, view.own_history, maps=next(folded))
+            x = time_layer(x, source, view.history, maps=next(folded))
             x = map_layer(x, None, view.map_tokens, goal_edges=goal_edges, maps=next(folded))
             x = agent_layer(x, normalize(x), view.agents, maps=next(folded))
         if scene.token_keys is not None:
             scenario, _, agent, _ = view.rows
             class_id, token_id = scene.class_id[scenario, agent], steps.token_id[view.rows]
-            x = torch.cat([x, scene.token_keys.phase_before[class_id, token_id]], -1)
+            x = torch.cat([x, scene.token_keys.last_phase[class_id, token_id]], -1)
         return x, replace(view.past, sources=tuple(sources))
 
     def _embed_steps(
-        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], poses: Poses, goals: EncodedGoals | None
+        self, scene: Scene, steps: TokenSteps, view: View, goals: EncodedGoals | None
     ) -> Float[Tensor, "R D"]:
         """Initial features: the token that led to a step, and motion, class, size and goal of the agent."""
-        scenario, _, agent, _ = rows
-        motion = steps.motion[rows]
-        # length of the motion, and its direction relative to the heading
-        motion_values = torch.stack([motion.norm(dim=-1), angle_between(heading_vector(poses.heading), motion)], -1)
+        scenario, _, agent, _ = view.rows
+        motion = steps.motion[view.rows]
+        # length of the motion, and the direction relative to the heading
+        bearing = angle_between(heading_vector(view.poses.heading), motion)
+        motion_values = torch.stack([motion.norm(dim=-1), bearing], -1)
         agent_features = scene.agent_features[scenario, agent]
         if goals is not None and isinstance(self.goal, GoalEmbedding):
-            conditioned, embedded = self.goal.embed(goals, poses, rows, seam_rad=self.config.seam_rad)
+            conditioned, embedded = self.goal.embed(goals, view.poses, view.rows, seam_rad=self.config.seam_rad)
             agent_features = agent_features.index_add(0, conditioned, embedded.to(agent_features.dtype))
         state = self.motion(motion_values, agent_features)
-        token = scene.token_features[scene.class_id[scenario, agent], steps.token_id[rows]]
+        token = scene.token_features[scene.class_id[scenario, agent], steps.token_id[view.rows]]
         return self.fusion(torch.cat([token, state], -1))
 
-    def _own_history(
-        self,
-        scene: Scene,
-        past: Past,
-        steps: TokenSteps,
-        rows: tuple[Tensor, ...],
-        poses: Poses,
-        hidden: Bool[Tensor, "B N A K"] | None,
-        build: Callable[..., Neighborhoods],
-    ) -> Neighborhoods:
-        """Up to `history_tokens` earlier steps of the same agent."""
-        scenario, rollout, agent, step = rows
-        before = past.row.shape[-1] - steps.valid.shape[-1]
+    def _find_history(
+        self, past: Past, steps: TokenSteps, rows: tuple[Tensor, ...], poses: Poses, hidden: Tensor | None
+    ) -> tuple[Float[Tensor, "R W 4"], Int64[Tensor, "R W"], Bool[Tensor, "R W"]]:
+        """Relations, rows and mask of up to `history_tokens` earlier steps of the same agent."""
+        step = rows[-1]
         lag = torch.arange(1, self.config.history_tokens + 1, device=step.device)
-        column = before + step[:, None] - lag  # [R, W], steps in the past and the block
-        place = (scenario[:, None], rollout[:, None], agent[:, None], column.clamp(min=0))
-        row = past.row[place]
+        column = past.row.shape[-1] - steps.valid.shape[-1] + step[:, None] - lag  # [R, W], in the past and the block
+        past_index = (*(index[:, None] for index in rows[:3]), column.clamp(min=0))
+        row = past.row[past_index]
         mask = (row >= 0) & (column >= 0)
         # in pre-training a pair is hidden from all rows alike; in closed loop the steps are not known at once, each
         # row draws anew
         if hidden is not None:
-            mask = mask & ~hidden[place] & ~hidden[rows][:, None]
+            mask = mask & ~hidden[past_index] & ~hidden[rows][:, None]
         elif self.training and self.config.history_drop:
             mask = mask & (torch.rand(mask.shape, device=mask.device) >= self.config.history_drop)
-        values = relative_pose(poses, Poses(past.position, past.heading)[place], seam_rad=self.config.seam_rad)
+        values = relative_pose(poses, Poses(past.position, past.heading)[past_index], seam_rad=self.config.seam_rad)
         # the time between, in tokens, is the fourth value of the relation
         values = torch.cat([values, -lag[:, None].expand(len(step), -1, 1).to(values.dtype)], -1)
-        return build(scene.relations.time, values, row.clamp(min=0), mask)
+        return values, row.clamp(min=0), mask
 
-    def _goal_edges(
-        self, scene: Scene, rows: tuple[Tensor, ...], poses: Poses, goals: EncodedGoals | None
-    ) -> GoalEdges | None:
-        """Relations to each agent's goal polyline; None if the encoding is another one or no agent has a goal."""
+    def _build_goal_edges(self, scene: Scene, view: View, goals: EncodedGoals | None) -> GoalEdges | None:
+        """Relations to each agent's goal polyline; None with another encoding, or if no agent has a goal."""
         if goals is None or not isinstance(self.goal, GoalEdgeEmbedding):
             return None
-        polyline = goals.polyline[rows[:3]]
+        polyline = goals.polyline[view.rows[:3]]
         has_goal = polyline >= 0
-        conditioned = rows_where(has_goal)  # [g]
+        conditioned = select_rows(has_goal)  # [g]
         token = polyline[conditioned].clamp(min=0)
-        values = relative_pose(poses[conditioned], scene.map_poses[token[:, None]], seam_rad=self.config.seam_rad)[:, 0]
+        goal_poses = scene.map_poses[token[:, None]]
+        values = relative_pose(view.poses[conditioned], goal_poses, seam_rad=self.config.seam_rad)[:, 0]
         # not the table of the embedding, which ends at the radius of ordinary relations
         relation, goal_relation = self.goal.embed(self.map_relation, values)
         # where all rows are conditioned, those without a goal get a relation that changes nothing
         goal_relation = torch.where(has_goal[conditioned, None], goal_relation, relation)
         return GoalEdges(conditioned, relation, goal_relation, scene.map_features[token])
 
-    def _agent_neighbors(
-        self,
-        scene: Scene,
-        steps: TokenSteps,
-        rows: tuple[Tensor, ...],
-        poses: Poses,
-        row_of: Int64[Tensor, "B N A K"],
-        build: Callable[..., Neighborhoods],
-    ) -> Neighborhoods:
-        """Other agents of the same scenario, rollout and step within reach."""
-        scenario, rollout, agent, step = rows
-        # agents of the same scenario, rollout and step are candidates of one place
-        candidates = nowhere_unless(steps.valid, steps.position).transpose(2, 3)  # [B, N, K, A, 2]
-        _, num_rollouts, num_steps, _, _ = candidates.shape
-        neighbors = within(
-            poses.position, (scenario * num_rollouts + rollout) * num_steps + step, candidates.flatten(0, 2), agent,
-            radius_m=self.config.agent_radius_m, limit=self.config.max_agent_neighbors, most=candidates.shape[3],
-        )  # fmt: skip
-        # from places among candidates to rows; padding is clamped to any row, its mask is False
-        row = row_of.transpose(2, 3).flatten()[neighbors.index].clamp(min=0)
-        neighbors = Neighbors(row, neighbors.mask)
-        return build(scene.relations.agent, self._relative(poses, poses, neighbors), neighbors.index, neighbors.mask)
-
-    def _relative(self, poses: Poses, sources: Poses, neighbors: Neighbors) -> Float[Tensor, "R K 3"]:
-        return relative_pose(poses, sources[neighbors.index], seam_rad=self.config.seam_rad)
-
 
 class SmartNetwork(nn.Module):
     """Map encoder and agent decoder.
 
     Args:
-        config: sizes.
-        num_tokens: V, the largest number of tokens of a class.
-        class_sizes: numbers of tokens of each class's own head; empty = all classes share one head.
+        config: Sizes, radii and options of the architecture.
+        num_tokens: Largest number of tokens V of a class, the width of the logits.
+        class_sizes: Number of tokens of each class, each with a head; empty = all classes share a single head.
     """
 
     def __init__(self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = ()):
@@ -478,10 +451,10 @@ class SmartNetwork(nn.Module):
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self, config.frequency_init)
-        for part in self.decoder.goal_modules():
-            part.zero_init()
+        for module in self.decoder.goal_modules():
+            module.zero_init()
 
-    def seeing_weights(self) -> list[Tensor]:
-        """Weights that scenes and views are made of: all but those of the decoder's `reading_parts`."""
-        ids = {id(weight) for part in self.decoder.reading_parts() for weight in part.parameters()}
+    def scene_weights(self) -> list[Tensor]:
+        """Weights that scenes and views are made with: all but those of the decoder's `reader_modules`."""
+        ids = {id(weight) for module in self.decoder.reader_modules() for weight in module.parameters()}
         return [weight for weight in self.parameters() if id(weight) not in ids]

@@ -17,7 +17,7 @@ from rlftsim.policies.distributions import CategoricalDistribution, TokenDistrib
 from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, encode_goals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
-from rlftsim.policies.smart.network import nowhere_unless
+from rlftsim.policies.smart.network import mask_positions
 from rlftsim.policies.smart.state import Replay, SmartContext, SmartState, TeacherForced
 from rlftsim.policies.smart.token_steps import TokenSteps, match_imposed, place_tokens
 from rlftsim.rollout.policy import DecisionDistribution
@@ -31,7 +31,7 @@ from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_t
 class SmartPolicy(SmartModel):
     """Next-token traffic model of all agents of a scenario.
 
-    It holds weights and a vocabulary, and no state of a simulation.
+    Holds weights and a vocabulary, and no state of a simulation.
     """
 
     fingerprint_name = "rlftsim.policies.smart.policy.SmartPolicy"
@@ -44,12 +44,12 @@ class SmartPolicy(SmartModel):
     def __repr__(self) -> str:
         # torch would print every layer
         goals = "follows goals" if self.is_goal_conditioned else "follows no goals"
-        return f"{type(self).__name__}({sum(one.numel() for one in self.parameters()):,} weights, {goals})"
+        return f"{type(self).__name__}({sum(weight.numel() for weight in self.parameters()):,} weights, {goals})"
 
     def encode(self, scenarios: ScenarioBatch) -> SmartContext:
         """Map features, history tokens and their decoder features, for goal-free agents."""
         tokens = self._tokenize(scenarios)
-        scene = self._scene(scenarios)
+        scene = self._build_scene(scenarios)
         history = self._logged_steps(tokens, slice(0, HISTORY_TOKENS))
         view = self.network.decoder.look(scene, history, None)
         rows, past = self.network.decoder(scene, history, None, view)
@@ -71,10 +71,10 @@ class SmartPolicy(SmartModel):
         """The current step, N times, without copies of the history.
 
         Args:
-            context: of `encode`.
-            num_rollouts: N.
-            goals: of all agents; ignored by a goal-free model.
-            noise: empty.
+            context: Result of `encode` for the scenarios.
+            num_rollouts: Number N of futures that each scenario gets.
+            goals: Goals [B, N, A] of all agents, map frame; ignored by a goal-free model. None = goal-free.
+            noise: Empty tensor, since the start of a simulation is not random.
         """
 
         def repeated(v: Tensor) -> Tensor:
@@ -83,29 +83,28 @@ class SmartPolicy(SmartModel):
         position, heading = repeated(context.position), repeated(context.heading)
         if goals is None or not self.is_goal_conditioned or not goals.any:
             return SmartState(position, heading, context.past.repeat(num_rollouts), pending=None)
-        # the context is goal-free: the current step goes through the decoder again, with goals; the step before it
-        # does not
+        # the context is goal-free: the current step goes through the decoder again, with goals; earlier steps do not
         return SmartState(
             position,
             heading,
             context.past.without_last_step().repeat(num_rollouts),
             pending=context.history.last.repeat(num_rollouts),
-            goals=encode_goals(goals, nowhere_unless(context.scene.map_mask, context.scene.map_position)),
+            goals=encode_goals(goals, mask_positions(context.scene.map_mask, context.scene.map_position)),
         )
 
     def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
         """Distributions [B, N, A] of the next token of every agent.
 
         Args:
-            context: of `encode`.
-            state: before the decision. Its cache is filled.
+            context: Result of `encode` for the scenarios.
+            state: State before the decision, whose cache is filled.
         """
         mask = context.agent_mask[:, None].expand(state.heading.shape)
         num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
         if context.is_padded:
             mask = torch.ones_like(mask)
-        features = pick_rows(self._features(context, state), mask, is_dense=context.is_padded)
-        dist = self._distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
+        features = pick_rows(self._compute_features(context, state), mask, is_dense=context.is_padded)
+        dist = self._build_distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
         return TokenDistribution(dist.logits, mask)
 
     def advance(
@@ -118,18 +117,18 @@ class SmartPolicy(SmartModel):
         """State after the chosen token's five poses. The decoder is not run, the step waits in `pending`.
 
         Args:
-            context: of `encode`.
-            state: before the decision.
-            decision: token ids.
-            forced: states of the five steps imposed from outside.
+            context: Result of `encode` for the scenarios.
+            state: State before the decision, which stays as it is.
+            decision: Id of the token that each agent takes, within the agent's class.
+            forced: States [B, N, A, 5] imposed from outside; only agents whose five states are all valid are imposed.
         """
-        before, config = (state.position, state.heading, context.object_type, self.vocabulary), self.config
-        poses = place_tokens(decision, *before, catk_compat=config.catk_compat)  # [B, N, A, 5, 3]
+        start = (state.position, state.heading, context.object_type, self.vocabulary)
+        poses = place_tokens(decision, *start, catk_compat=self.config.catk_compat)  # [B, N, A, 5, 3]
         if forced is not None:
             imposed = forced.valid.all(-1)
             forced_poses = torch.cat([forced.position, forced.heading[..., None]], -1)
             poses = torch.where(imposed[..., None, None], forced_poses, poses)
-            decision = match_imposed(decision, imposed, poses[..., -1, :], *before)
+            decision = match_imposed(decision, imposed, poses[..., -1, :], *start)
         position, heading = poses[..., -1, :2], poses[..., -1, 2]
         block = TokenSteps(
             position=position[..., None, :],
@@ -138,12 +137,12 @@ class SmartPolicy(SmartModel):
             token_id=decision[..., None],
             valid=context.agent_mask[:, None, :, None].expand(*heading.shape, 1),
         )
-        # while simulating, `decide` has filled the cache, so one step is pending; in `score` nothing has, and steps
-        # pile up
+        past, pending = state.past, block
+        # while simulating, `decide` has filled the cache, so a single step is pending; in `score` steps pile up
         if state.cache.past is not None:
-            past, pending = state.cache.past, block
-        else:
-            past, pending = state.past, block if state.pending is None else state.pending.then(block)
+            past = state.cache.past
+        elif state.pending is not None:
+            pending = state.pending.append(block)
         num_decisions = state.num_decisions + 1
         return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
@@ -151,13 +150,13 @@ class SmartPolicy(SmartModel):
         """Distributions [B, N, A, L] along rollouts: one pass of the decoder over all steps.
 
         Args:
-            context: of `encode`.
-            rollouts: of the same scenarios.
+            context: Result of `encode` for the scenarios.
+            rollouts: Rollouts of the same scenarios, by this policy or another.
         """
         return self._score(context, self._replay(context, rollouts))
 
     def _replay(self, context: SmartContext, rollouts: Rollouts) -> Replay:
-        """Take the decisions of rollouts again, without the decoder, and look around at every step."""
+        """Repeat the decisions of rollouts without the decoder, and look around at every step."""
         state = self.begin(context, rollouts.num_rollouts, rollouts.goals, rollouts.log_prob[..., :0])
         # the last decision leads nowhere that is scored
         for index in range(rollouts.decision.shape[3] - 1):
@@ -169,18 +168,17 @@ class SmartPolicy(SmartModel):
         return Replay(state, view)
 
     def _score(self, context: SmartContext, replay: Replay) -> CategoricalDistribution:
-        """Distributions along rollouts that have been replayed, by this model or by one that sees alike."""
+        """Distributions along rollouts that have been replayed, by this model or by a model that sees alike."""
         state = replay.state
-        # 1. features [B, N, A, L, D]: of the current step, which goal-free agents have in the context, and of all
-        # later ones
-        parts = []
+        # 1. features [B, N, A, L, D]: of the current step, from the context for goal-free agents, and of later steps
+        blocks = []
         if state.goals is None:
-            parts.append(context.features[:, None, :, None].expand(*state.heading.shape, 1, -1))
+            blocks.append(context.features[:, None, :, None].expand(*state.heading.shape, 1, -1))
         if state.pending is not None:
             past = replace(state.past, sources=context.past.sources)
             rows, _ = self.network.decoder(context.scene, state.pending, past, replay.view, state.goals)
-            parts.append(place_rows(rows, state.pending.valid))
-        features = torch.cat(parts, 3)
+            blocks.append(place_rows(rows, state.pending.valid))
+        features = torch.cat(blocks, 3)
         # 2. distributions of the agents; padding is left out
         mask = context.agent_mask[:, None, :, None].expand(features.shape[:4])
         num_left = (NUM_DECISIONS - torch.arange(mask.shape[3], device=mask.device)).expand(mask.shape)
@@ -188,16 +186,16 @@ class SmartPolicy(SmartModel):
         if state.goals is not None:
             assert state.pending is not None  # with goals even the current step was pending
             poses = Poses(state.pending.position, state.pending.heading)
-        return self._distribution(context, state, features[mask], mask, poses, num_left)
+        return self._build_distribution(context, state, features[mask], mask, poses, num_left)
 
-    # ---- passes that share what they have in common -----------------------------------------------------------------
+    # ---- passes that share scenes and views -------------------------------------------------------------------------
 
     def encode_like(self, scenarios: ScenarioBatch, context: Any) -> SmartContext:
         """`encode(scenarios)`, with scene and history taken over from a context of a model that sees alike.
 
         Args:
-            scenarios: of the context.
-            context: of any policy, whose weights are still those that made it.
+            scenarios: Scenarios that `context` was encoded from, in the same order.
+            context: Context of any policy whose weights have not changed since.
         """
         if not isinstance(context, SmartContext) or not self.sees_as(context.model):
             return self.encode(scenarios)
@@ -210,14 +208,14 @@ class SmartPolicy(SmartModel):
     ) -> tuple[CategoricalDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
-        Both look around once if they have a scene in common and the rollouts are the same.
+        Both look around once if the scene is shared and the rollouts are the same.
 
         Args:
-            context: of this policy.
-            rollouts: of the same scenarios.
-            reference: any policy.
-            ref_context: of the reference.
-            ref_rollouts: the same rollouts, maybe with other goals.
+            context: Context of this policy for the scenarios.
+            rollouts: Rollouts of the same scenarios, to score under both policies.
+            reference: Policy of any architecture, whose distributions get no gradient.
+            ref_context: Context of the reference for the scenarios.
+            ref_rollouts: The same rollouts, maybe with other goals.
         """
         replay = self._replay(context, rollouts)
         dist = self._score(context, replay)
@@ -233,8 +231,8 @@ class SmartPolicy(SmartModel):
         """Predict every next token along the logged tracks.
 
         Args:
-            scenarios: with their future.
-            trained: True = the agent's predictions count; the others are context.
+            scenarios: Scenarios with the logged future, which is predicted.
+            trained: True = the agent's predictions count, False = the agent is context alone.
         """
         tokens = self._tokenize(scenarios)
         steps = self._logged_steps(tokens, slice(0, -1))
@@ -242,7 +240,7 @@ class SmartPolicy(SmartModel):
         hidden = None
         if self.training and self.config.history_drop:
             hidden = torch.rand(steps.valid.shape, device=steps.valid.device) < self.config.history_drop
-        scene = self._scene(scenarios)
+        scene = self._build_scene(scenarios)
         rows, _ = self.network.decoder(scene, steps, None, self.network.decoder.look(scene, steps, None, hidden))
         # predictions start at the current step, as in a simulation
         decides = steps.valid.clone()  # [B, 1, A, K]
@@ -253,10 +251,10 @@ class SmartPolicy(SmartModel):
         class_id = class_id[:, None, :, None].expand(decides.shape)[decides]
         return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
-    # ---- parts ----------------------------------------------------------------------------------------------------
+    # ---- passes of the decoder and the head -----------------------------------------------------------------------
 
-    def _features(self, context: SmartContext, state: SmartState) -> Float[Tensor, "B N A D"]:
-        """Decoder features at the state's last step, from its cache after the first call."""
+    def _compute_features(self, context: SmartContext, state: SmartState) -> Float[Tensor, "B N A D"]:
+        """Decoder features at the state's last step, from the cache after the first call."""
         cache = state.cache
         if cache.features is None:
             decoder, past = self.network.decoder, state.past
@@ -270,7 +268,7 @@ class SmartPolicy(SmartModel):
                 cache.features = place_rows(rows, state.pending.valid)[..., -1, :]
         return cache.features
 
-    def _distribution(
+    def _build_distribution(
         self,
         context: SmartContext,
         state: SmartState,
@@ -279,7 +277,7 @@ class SmartPolicy(SmartModel):
         poses: Poses | None,
         num_left: Int64[Tensor, "*batch"],
     ) -> CategoricalDistribution:
-        """Distributions of the elements of a mask. Poses before each decision are needed where agents have goals."""
+        """Distributions of the elements of a mask, given the poses before each decision where agents have goals."""
         dist = self._predict(context.scene, features, context.token_class, mask)
         bias = self.network.decoder.aim
         if bias is None or state.goals is None or poses is None:

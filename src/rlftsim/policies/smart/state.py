@@ -17,7 +17,7 @@ from rlftsim.policies.smart.token_steps import TokenSteps
 
 @dataclass(frozen=True, eq=False)
 class SmartContext:
-    """Everything that does not depend on the agents' decisions, computed once per scenario."""
+    """Features and geometry that do not depend on the agents' decisions, computed once per scenario."""
 
     scene: Scene
     history: TokenSteps
@@ -36,7 +36,7 @@ class SmartContext:
     """Class that an agent's token ids refer to."""
     agent_mask: Bool[Tensor, "B A"]
     model: nn.Module
-    """The model that made it."""
+    """The model that encoded the scenario."""
 
     @cached_property
     def maps(self) -> tuple[AttentionMaps, ...]:
@@ -45,13 +45,13 @@ class SmartContext:
 
     @property
     def is_padded(self) -> bool:
-        """True off the CPU: in closed loop padding is simulated, too. To leave it out, the host would wait for it."""
+        """True off the CPU: in closed loop padding is simulated, too. The host would wait to leave padding out."""
         return self.agent_mask.device.type != "cpu"
 
 
 @dataclass(eq=False)
 class DecoderCache:
-    """Decoder outputs of a state, filled at the first use. They follow from the state: a memo, no part of its value."""
+    """Decoder outputs of a state, filled at the first use: a memo of values that follow from the state."""
 
     features: Float[Tensor, "B N A D"] | None = None
     """Decoder features at the state's last step."""
@@ -63,7 +63,7 @@ class DecoderCache:
 class SmartState:
     """Running simulations.
 
-    Steps that have not been through the decoder wait in `pending`; they go through it at most once.
+    Steps that have not been through the decoder wait in `pending`, and go through the decoder at most once.
     """
 
     position: Float[Tensor, "B N A 2"]
@@ -81,7 +81,7 @@ class SmartState:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Rollouts ready to be scored: nothing in it depends on weights that fine-tuning trains, but for the past."""
+    """Rollouts ready to be scored. But for the past, no value depends on weights that fine-tuning trains."""
 
     state: SmartState
     """Before the last decision, all steps that are to be scored pending."""

@@ -17,7 +17,7 @@ from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
 
 @dataclass(frozen=True, eq=False)
 class TokenSteps:
-    """States of agents at a block of token steps and the tokens that led there. Map frame."""
+    """States of agents at a block of token steps, map frame, and the tokens that led to these states."""
 
     position: Float[Tensor, "B N A K 2"]
     heading: Float[Tensor, "B N A K"]
@@ -26,33 +26,30 @@ class TokenSteps:
     token_id: Int64[Tensor, "B N A K"]
     valid: Bool[Tensor, "B N A K"]
 
-    def then(self, other: "TokenSteps") -> "TokenSteps":
-        """This block followed by another one."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
-        return TokenSteps(*(torch.cat(pair, 3) for pair in pairs))
+    def append(self, steps: "TokenSteps") -> "TokenSteps":
+        """The block with further steps behind it."""
+        return TokenSteps(*(torch.cat(pair, 3) for pair in zip(vars(self).values(), vars(steps).values())))
 
     @property
     def last(self) -> "TokenSteps":
         """The last step of the block."""
-        return TokenSteps(*(getattr(self, name)[:, :, :, -1:] for name in self.__dataclass_fields__))
+        return TokenSteps(*(values[:, :, :, -1:] for values in vars(self).values()))
 
     def repeat(self, num_rollouts: int) -> "TokenSteps":
-        """The steps of a single rollout, shared by N of them; no copies."""
-        fields = (getattr(self, name) for name in self.__dataclass_fields__)
-        return TokenSteps(*(v.expand(-1, num_rollouts, *v.shape[2:]) for v in fields))
+        """The steps of a single rollout, shared by N rollouts; no copies."""
+        return TokenSteps(*(v.expand(-1, num_rollouts, *v.shape[2:]) for v in vars(self).values()))
 
 
-def logged_steps(tokens: AgentTokens, steps: slice, *, catk_compat: bool) -> TokenSteps:
+def build_logged_steps(tokens: AgentTokens, steps: slice, *, catk_compat: bool) -> TokenSteps:
     """A block of logged token steps, as a single rollout.
 
     Args:
-        tokens: of the logged tracks [B, A, K].
-        steps: the block.
-        catk_compat: motion vectors as in the public code, where an agent's first one is its position.
+        tokens: Tokens [B, A, K] of the logged tracks.
+        steps: Slice of the token steps K that the block takes.
+        catk_compat: Motion vectors as in the public code, where the first motion of an agent is the position.
     """
     position = tokens.position
-    before = torch.cat([torch.zeros_like(position[:, :, :1]), position[:, :, :-1]], 2)
-    motion = position - before  # [B, A, K, 2]
+    motion = torch.diff(position, dim=2, prepend=torch.zeros_like(position[:, :, :1]))  # [B, A, K, 2]
     if catk_compat:
         # there the position before the first valid step is zero, and only the very first step has no motion
         motion[:, :, 0] = 0.0
@@ -75,12 +72,12 @@ def place_tokens(
     """The five poses (x, y, heading) of the chosen tokens, placed at the current states. Padding stands still.
 
     Args:
-        decision: token ids.
-        position: before the decision.
-        heading: before the decision.
-        object_type: of the agents.
-        vocabulary: of the tokens.
-        catk_compat: the public code's order of operations, which places boxes and takes poses from their corners.
+        decision: Id of the token that each agent takes, within the agent's class.
+        position: Positions before the decision, meters.
+        heading: Headings before the decision, radians.
+        object_type: Object type of each agent, which decides the token class.
+        vocabulary: Vocabulary that the token ids refer to.
+        catk_compat: Order of operations of the public code, which places boxes and takes poses from the corners.
     """
     class_id = class_of_type(object_type)[:, None].expand(decision.shape)
     if catk_compat:
@@ -90,8 +87,8 @@ def place_tokens(
         local = vocabulary.poses[class_id, decision]  # [B, N, A, 5, 3], agent's frame
         new_position = position[..., None, :] + rotate(local[..., :2], heading[..., None])
         # without a turn the heading keeps its bits: agents at the same pose share a list of neighbors
-        turn, before = local[..., 2], heading[..., None]
-        new_heading = torch.where(turn == 0, before, wrap_angle(before + turn))
+        turn, start = local[..., 2], heading[..., None]
+        new_heading = torch.where(turn == 0, start, wrap_angle(start + turn))
     return torch.cat([new_position, new_heading[..., None]], -1)
 
 
@@ -104,16 +101,16 @@ def match_imposed(
     object_type: Int64[Tensor, "B A"],
     vocabulary: Vocabulary,
 ) -> Int64[Tensor, "B N A"]:
-    """Decisions, replaced for imposed agents by the nearest token: the decoder sees them as if they had chosen it.
+    """Decisions, replaced for imposed agents by the nearest token, as if these agents had chosen that token.
 
     Args:
-        decision: token ids.
+        decision: Id of the token that each agent took, within the agent's class.
         imposed: True = the agent's poses came from outside.
-        end: last pose (x, y, heading) of the step.
-        position: before the step.
-        heading: before the step.
-        object_type: of the agents.
-        vocabulary: of the tokens.
+        end: Last pose (x, y, heading) of the step, meters and radians.
+        position: Positions before the step, meters.
+        heading: Headings before the step, radians.
+        object_type: Object type of each agent, which decides the box and the token class.
+        vocabulary: Vocabulary that the token ids refer to.
     """
     length, width = class_boxes(object_type)
     corners = box_corners(end[..., :2], end[..., 2], length[:, None], width[:, None])  # [B, N, A, 4, 2]

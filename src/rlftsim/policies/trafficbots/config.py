@@ -5,12 +5,12 @@ from typing import ClassVar
 
 from rlftsim.errors import (
     ConfigError,
+    check_finiteness,
     check_limits,
+    check_not_negative,
+    check_positive,
+    check_types,
     given,
-    require_finite,
-    require_not_negative,
-    require_positive,
-    require_types,
 )
 
 WINDOW = 11
@@ -84,15 +84,15 @@ class TrafficBotsConfig:
     """Decisions that are scored with gradient at once; fewer need less memory, the result is the same."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         sizes = ("dim", "num_heads", "num_map_layers", "num_light_layers", "num_agent_layers")
         neighbors = ("map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors")
         distances = ("radius_m", "light_radius_m", "noise_acceleration_mps2", "noise_yaw_rate_radps")
         distances += given(self, ("noise_pedestrian_yaw_rate_radps",))
         counts = ("agent_neighbors", "forcing_updates", "steps_per_pass", *given(self, ("max_map_tokens",)))
-        require_positive(self, (*sizes, *neighbors, *distances, *counts))
-        require_finite(self, (*distances, "free_nats"))
-        require_not_negative(self, ("free_nats",))
+        check_positive(self, (*sizes, *neighbors, *distances, *counts))
+        check_finiteness(self, (*distances, "free_nats"))
+        check_not_negative(self, ("free_nats",))
         check_limits(self, dict.fromkeys(("num_map_layers", "num_light_layers", "num_agent_layers"), 256))
         check_limits(self, dict.fromkeys(("dim", "num_heads"), 65_536) | dict.fromkeys(distances, 100_000))
         check_limits(self, dict.fromkeys((*neighbors, *counts), 2**31 - 1))
