@@ -100,7 +100,7 @@ class StoredModel:
 
 
 def _check_names(settings: Mapping[str, Any], names: set[str]) -> None:
-    """Check that the settings are those of a dataclass: a default for a missing value would make another model."""
+    """Check that the settings are those of a dataclass: a default for a missing value would make a different model."""
     missing, extra = (", ".join(sorted(s)) or "none" for s in (names - settings.keys(), settings.keys() - names))
     if settings.keys() != names:
         raise ConfigError(
@@ -121,7 +121,7 @@ def save_model(
 
     Args:
         folder: Folder of the model, created where it is missing.
-        policy: Policy whose class attribute `architecture` is the registered name.
+        policy: Policy with the registered name as class attribute `architecture`.
         config: Settings that the policy is built with when loaded, values that JSON has.
         card: Text of README.md; empty = a line that says that the origin is unknown.
         weights: Tensors by name; None = the policy's state dict, or no weights file for a policy that is no nn.Module.
@@ -156,7 +156,7 @@ def read_model(folder: str | os.PathLike, *, architecture: str | None = None) ->
     Raises:
         ConfigError: There is no such folder.
         CheckpointError: The folder holds no model, is damaged, belongs to a run that has not finished, or holds
-            another architecture.
+            a different architecture.
     """
     path = find_model(folder)
     try:
@@ -242,7 +242,7 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
     Args:
         module: Module that receives the weights.
         weights: Tensors by name, as in the module's state dict.
-        source: File or folder of the weights, for the message.
+        source: File or folder of the weights, which the message of an error names.
 
     Raises:
         CheckpointError: A name, shape or type differs, or a weight is not finite; the message names the first few.
@@ -279,7 +279,7 @@ def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], 
     Args:
         weights: Tensors by name, as in a file.
         expected: State dict of the model; only names, shapes and types are read.
-        source: File or folder of the weights, for the message.
+        source: File or folder of the weights, which the message of an error names.
 
     Raises:
         CheckpointError: A name, shape or type differs; the message names the first few.
@@ -332,7 +332,7 @@ def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, s
     Args:
         make: Function that builds the network on torch's default device, which has no memory here.
         weights: Stored weights by name.
-        source: File or folder of the weights, for the message.
+        source: File or folder of the weights, which the message of an error names.
 
     Raises:
         CheckpointError: The weights have other names, shapes or number types.

@@ -53,7 +53,7 @@ class CategoricalDistribution:
         """Log-probability of token ids under the distribution that `sampling` draws from.
 
         Args:
-            decision: Token ids, as `sample` returns.
+            decision: Token ids in the vocabulary, as `sample` returns.
             sampling: Temperature and truncation of the draw. A token that truncation excludes has -inf.
         """
         if sampling.temperature == 0:
@@ -135,8 +135,8 @@ class LazyTokenDistribution(CategoricalDistribution):
         """Log-probability as of any `CategoricalDistribution`; without logits for the full distribution.
 
         Args:
-            decision: Token ids, as `sample` returns.
-            sampling: Temperature and truncation of the draw.
+            decision: Token ids in the vocabulary, as `sample` returns.
+            sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
         """
         if not sampling.is_full:
             return super().log_prob(decision, sampling)

@@ -83,16 +83,8 @@ class _RowStatistics(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        hidden: Float[Tensor, "R D"],
-        weight: Float[Tensor, "V D"],
-        offset: Float[Tensor, "C V"],
-        class_id: Int64[Tensor, "R"],
-        token: Int64[Tensor, "R"],
-        *reference: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = (hidden, weight, offset, class_id, token, *reference)
+    def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        hidden, _, _, _, token, *_ = inputs
         # At least float32, as the logits of `_logits`: hidden features are bfloat16 under autocast.
         dtype = torch.promote_types(hidden.dtype, torch.float32)
         log_prob, kl, entropy = hidden.new_empty(3, len(hidden), dtype=dtype)

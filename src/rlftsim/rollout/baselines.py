@@ -111,8 +111,8 @@ class ConstantVelocity:
         """The current state, N times.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            num_rollouts: Number N of simulations of each scenario.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            num_rollouts: Number N of simulations of each scenario, all in a single state.
             goals: Goals of agents, ignored: a constant velocity follows none.
             noise: Noise [B, N, A, 0], empty since nothing is drawn.
         """
@@ -155,7 +155,7 @@ class ConstantVelocity:
         """Distributions [B, N, A, L]: the same velocity at every decision.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             rollouts: Rollouts of the same scenarios; only the shape of the decisions is read.
         """
         return PointMass(context.velocity[:, None, :, None].expand_as(rollouts.decision))

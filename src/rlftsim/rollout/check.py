@@ -265,6 +265,17 @@ def _check_gap(a: Tensor, b: Tensor, allowed: float, title: str = "largest gap")
     return _check_limit(_compute_gap(a, b), allowed, title)
 
 
+def _check_scores(subject: _Subject, rollouts: Rollouts) -> str:
+    """Text of the largest difference between scored and sampled log-probabilities, or `_Broken` with the text."""
+    return _check_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
+
+
+def _check_worst(gaps: dict[str, float], allowed: float, title: str) -> str:
+    """Text of the largest of named gaps, or `_Broken` with the text."""
+    worst = max(gaps, key=lambda name: gaps[name])
+    return _check_limit(gaps[worst], allowed, f"{title} ({worst})")
+
+
 def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
     """A `force` along arcs: of the first agent throughout, of every third from the second on for two seconds."""
     states = (batch.position, batch.velocity, batch.heading)
@@ -295,8 +306,7 @@ def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], A
 
 def scored_log_probs_equal_sampled_ones(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones."""
-    scored = subject.log_prob(subject.batch, subject.rollouts)
-    return _check_gap(scored, subject.rollouts.log_prob, SCORE_TOLERANCE)
+    return _check_scores(subject, subject.rollouts)
 
 
 def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) -> str:
@@ -305,13 +315,12 @@ def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) ->
     assert rollouts.forced is not None
     offset = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
     _check_limit(float(offset.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
-    return _check_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
+    return _check_scores(subject, rollouts)
 
 
 def scored_log_probs_equal_sampled_ones_with_goals(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones where agents have goals."""
-    scored = subject.log_prob(subject.batch, subject.with_goals)
-    return _check_gap(scored, subject.with_goals.log_prob, SCORE_TOLERANCE)
+    return _check_scores(subject, subject.with_goals)
 
 
 def empty_goals_equal_no_goals(subject: _Subject) -> str:
@@ -320,7 +329,7 @@ def empty_goals_equal_no_goals(subject: _Subject) -> str:
     empty = Goals.of_scenarios(position, torch.zeros_like(subject.batch.agent_mask))
     rollouts = subject.simulate(subject.batch, goals=empty)
     _check_gap(rollouts.position, subject.rollouts.position, 0.0, "rollouts apart (m)")
-    return _check_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
+    return _check_scores(subject, rollouts)
 
 
 def scores_of_slices_equal_slices_of_scores(subject: _Subject) -> str:
@@ -504,40 +513,38 @@ def _measure_replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
 
 def gradients_reach_all_trained_weights(subject: _Subject) -> str:
     """Gradients of the score reach the trained weights and no frozen ones, and are finite."""
-    module = copy.deepcopy(subject.module)
-    trained = [p for p in module.parameters() if p.requires_grad]
-    if not trained:
-        raise _NotApplicable("no weight is trained")
-    _back_propagate(module, subject, scale=1.0)
+    weights = _back_propagate(subject, scale=1.0)
+    gradients = {name: p.grad for name, p in weights.items() if p.grad is not None}
     # a gradient may be zero (no light in these scenarios), but never absent
-    named = dict(module.named_parameters())
-    missing = [name for name, p in named.items() if p.requires_grad and p.grad is None]
-    strays = [name for name, p in named.items() if not p.requires_grad and p.grad is not None]
-    broken = [name for name, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
+    trained = [name for name, p in weights.items() if p.requires_grad]
+    missing = [name for name in trained if name not in gradients]
+    strays = [name for name in gradients if not weights[name].requires_grad]
+    broken = [name for name, gradient in gradients.items() if not gradient.isfinite().all()]
     if missing or strays or broken:
         raise _Broken(f"not reached: {missing}; reached though not trained: {strays}; not finite: {broken}")
-    flat = [name for name, p in named.items() if p.grad is not None and not p.grad.any()]
+    flat = [name for name, gradient in gradients.items() if not gradient.any()]
     return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
 
 
 def zero_reward_gives_zero_gradient(subject: _Subject) -> str:
     """With a reward of 0 the policy gradient is exactly 0."""
-    module = copy.deepcopy(subject.module)
-    if not any(p.requires_grad for p in module.parameters()):
-        raise _NotApplicable("no weight is trained")
-    _back_propagate(module, subject, scale=0.0)
-    largest = max(_compute_gap(p.grad, torch.zeros_like(p.grad)) for p in module.parameters() if p.grad is not None)
+    gradients = [weight.grad for weight in _back_propagate(subject, scale=0.0).values() if weight.grad is not None]
+    largest = max(_compute_gap(gradient, torch.zeros_like(gradient)) for gradient in gradients)
     return _check_limit(largest, 0.0, "largest gradient")
 
 
-def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> None:
-    """Back-propagate a policy-gradient loss whose rewards are `scale` times 1, 2, ... by rollout."""
+def _back_propagate(subject: _Subject, *, scale: float) -> dict[str, nn.Parameter]:
+    """Weights with gradients of a policy-gradient loss, with rewards of `scale` times 1, 2, ... by rollout."""
+    module = copy.deepcopy(subject.module)
+    if not any(weight.requires_grad for weight in module.parameters()):
+        raise _NotApplicable("no weight is trained")
     assert isinstance(module, Policy)
     module.zero_grad(set_to_none=True)
     rollouts = subject.with_goals  # so that weights for goals take part
     scored = module.score(module.encode(subject.batch), rollouts).log_prob(rollouts.decision)
     reward = scale * torch.arange(1.0, NUM_ROLLOUTS + 1, device=scored.device)[None, :, None, None]
     (-reward * torch.where(rollouts.decision_mask, scored, 0.0)).sum().backward()
+    return dict(module.named_parameters())
 
 
 def freezing_weights_changes_no_score(subject: _Subject) -> str:
@@ -584,8 +591,7 @@ def scores_are_invariant_to_rotation_and_translation(subject: _Subject) -> str:
         for rollouts in (still.rollouts, still.with_forced, still.with_goals):
             scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
             gaps[name] = max(gaps.get(name, 0.0), _compute_gap(scored, subject.log_prob(still.batch, rollouts)))
-    worst = max(gaps, key=lambda name: gaps[name])
-    return _check_limit(gaps[worst], SCORE_TOLERANCE + subject.rounding, f"largest gap ({worst})")
+    return _check_worst(gaps, SCORE_TOLERANCE + subject.rounding, "largest gap")
 
 
 def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
@@ -622,8 +628,7 @@ def edge_cases_can_be_simulated_and_scored(subject: _Subject) -> str:
         if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):
             raise _Broken(f"{name}: poses are not finite")
         gaps[name] = _compute_gap(subject.log_prob(batch, rollouts), rollouts.log_prob)
-    worst = max(gaps, key=lambda name: gaps[name])
-    return _check_limit(gaps[worst], SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap ({worst})")
+    return _check_worst(gaps, SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap")
 
 
 def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:

@@ -1,5 +1,6 @@
 """Variants of a scenario that policies must handle: moved, emptied, crowded, with agents that appear late."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 
 import numpy as np
@@ -35,14 +36,21 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
     def moved(points: np.ndarray) -> np.ndarray:
         return ((points.astype(np.float64) - center) @ matrix.T + center + shift).astype(np.float32)
 
-    tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
-    heading = wrapped(tracks.heading.astype(np.float64) + turn_rad)
-    velocity = (tracks.velocity.astype(np.float64) @ matrix[:2, :2].T).astype(np.float32)
+    heading = wrapped(scenario.tracks.heading.astype(np.float64) + turn_rad).astype(np.float32)
+    velocity = (scenario.tracks.velocity.astype(np.float64) @ matrix[:2, :2].T).astype(np.float32)
+    return _transform_points(scenario, moved, heading=heading, velocity=velocity)
+
+
+def _transform_points(
+    scenario: Scenario, transform: Callable[[np.ndarray], np.ndarray], **tracks: np.ndarray
+) -> Scenario:
+    """The scenario with all points transformed, and further fields of the tracks replaced."""
+    features, lights = scenario.map_features, scenario.lights
     return replace(
         scenario,
-        tracks=replace(tracks, position=moved(tracks.position), heading=heading.astype(np.float32), velocity=velocity),
-        map_features=replace(features, points=moved(features.points), polygon_rest=None),
-        lights=replace(lights, stop_point=moved(lights.stop_point)),
+        tracks=replace(scenario.tracks, position=transform(scenario.tracks.position), **tracks),
+        map_features=replace(features, points=transform(features.points), polygon_rest=None),
+        lights=replace(lights, stop_point=transform(lights.stop_point)),
     )
 
 
@@ -71,12 +79,7 @@ def place_on_grid(scenario: Scenario) -> Scenario:
     def rounded(points: np.ndarray) -> np.ndarray:
         return (np.round(points / GRID_M) * GRID_M).astype(np.float32)
 
-    return replace(
-        central,
-        tracks=replace(central.tracks, position=rounded(central.tracks.position)),
-        map_features=replace(central.map_features, points=rounded(central.map_features.points)),
-        lights=replace(central.lights, stop_point=rounded(central.lights.stop_point)),
-    )
+    return _transform_points(central, rounded)
 
 
 def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:

@@ -12,15 +12,15 @@ from torch import Tensor, nn
 def fingerprint_policy(policy: object) -> str:
     """Hash of a policy's architecture, weights and public settings (numbers, texts, tensors, dataclasses of these).
 
-    Moving code must leave the fingerprints of stored models valid. So a class is hashed under a name that it declares,
-    `fingerprint_name` or else `architecture`, and without either under its module and name. Classes of nested settings
+    Moving code must leave the fingerprints of stored models valid. So a class is hashed under the declared name,
+    `fingerprint_name` or else `architecture`, and without either under module and name. Classes of nested settings
     count too. A base class's name does not stand for a subclass, which is different code.
 
     Args:
-        policy: Policy of any class; weights count by their bytes, whatever device they lie on.
+        policy: Policy of any class; the bytes of weights count, whatever the device.
 
     Returns:
-        32 hexadecimal digits; for a policy without weights and settings they stand for the architecture alone.
+        32 hexadecimal digits; for a policy without weights and settings a hash of the architecture alone.
     """
     digest = hashlib.blake2b(digest_size=16)
     _feed(digest, policy)

@@ -93,7 +93,7 @@ class DecisionDistribution(Protocol):
         """Draw decisions; no gradient flows through them.
 
         Args:
-            sampling: Temperature and truncation of the draw.
+            sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
             noise: Uniform numbers in [0, 1), `Policy.noise_size` per element.
 
         Returns:
@@ -141,7 +141,7 @@ class StatisticsDistribution(Protocol):
         """Log-probability of a decision, KL(self || reference) and entropy, with gradient.
 
         Args:
-            decision: Decisions [..., *event], drawn from the full distribution.
+            decision: Decisions [..., *event], drawn from the full distribution without truncation.
             reference: Distribution of the same kind and elements; receives no gradient.
         """
         ...
@@ -152,7 +152,7 @@ def compute_statistics(distribution: DecisionDistribution, decision: Tensor, ref
 
     Args:
         distribution: Distribution of the policy that is trained.
-        decision: Decisions [..., *event], drawn from the full distribution.
+        decision: Decisions [..., *event], drawn from the full distribution without truncation.
         reference: Distribution of the same kind and elements that the KL divergence is measured from.
     """
     if isinstance(distribution, StatisticsDistribution):
@@ -167,11 +167,11 @@ class Policy(Protocol):
     Contexts and states are opaque values of the policy's classes, except that a state has two attributes:
 
     * `poses` [B, N, A, t, 3]: x, y, heading of the steps of the last decision in the map frame; None before the first.
-    * `draws` [B, N, ...]: what `begin` drew from its noise, once per rollout; None for most policies. A single
+    * `draws` [B, N, ...]: values that `begin` drew from the noise, once per rollout; None for most policies. A single
       tensor, which all other code slices along B and N and hands back to `score` as `Rollouts.draws`. Several values
       are packed along the last axis: 16 latent numbers and the index of a destination per agent are float32
       [B, N, A, 17], where integers are exact up to 2^24. Log-probabilities are conditional on the draws, and the
-      draws themselves are not rewarded: training changes what is decided given a latent, not how latents are drawn.
+      draws are not rewarded: training changes decisions given a latent, not how latents are drawn.
     """
 
     steps_per_decision: int
@@ -189,8 +189,8 @@ class Policy(Protocol):
         """State of N simulations at the current step.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            num_rollouts: Number N of simulations of each scenario.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            num_rollouts: Number N of simulations of each scenario, all in a single state.
             goals: Goals of agents in each rollout; None = goal-free. A policy that cannot follow goals ignores this.
             noise: Uniform numbers in [0, 1), `initial_noise_size` per agent.
         """
@@ -202,8 +202,8 @@ class Policy(Protocol):
         Log-probability, KL and entropy of padding are exactly 0.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            state: State before the decision, from `begin` or `advance`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            state: State of N simulations before the decision, from `begin` or `advance`.
         """
         ...
 
@@ -211,8 +211,8 @@ class Policy(Protocol):
         """State after a decision: kinematics only, no network.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            state: State before the decision, from `begin` or `advance`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            state: State of N simulations before the decision, from `begin` or `advance`.
             decision: Decisions [B, N, A, *event].
             forced: States [B, N, A, t] imposed from outside; None = none. An agent whose forced states are all valid
                 is put into these states, whatever was decided.
@@ -433,7 +433,7 @@ class PretrainablePolicy(SavedPolicy, Protocol):
         """Predictions of the next token of every agent at every step of its logged track.
 
         Args:
-            scenarios: Scenarios with logged futures.
+            scenarios: Scenarios with logged futures, the targets of imitation.
             trained: True = the agent's predictions count; other agents are context.
         """
         ...
@@ -533,7 +533,7 @@ class ImitatedPolicy(SavedPolicy, Protocol):
         """Loss of the logged futures.
 
         Args:
-            scenarios: Scenarios with logged futures.
+            scenarios: Scenarios with logged futures, the targets of imitation.
             trained: True = the agent counts; other agents are context.
             update: Number of the update from 0, for schedules. torch's generator was seeded for this update, so a
                 resumed run draws the same.

@@ -29,7 +29,7 @@ def sample_decision(
     Args:
         distribution: Distributions [B, N, A] of the next decision.
         state: State before the decision, not used here.
-        sampling: Temperature and truncation of the draw.
+        sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
         noise: Uniform numbers in [0, 1), `Policy.noise_size` per agent.
     """
     return distribution.sample(sampling, noise)
@@ -58,15 +58,15 @@ def simulate(
         batch: Scenarios to continue; only history, map and lights are read.
         num_rollouts: Number N of futures, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether
             drawn alone or among 32.
-        seed: Seed of the noise; the rollouts depend on nothing else that is random.
-        context: Result of `policy.encode(batch)` if it has been computed already; None = encode here.
-        goals: Goals of agents in each of the N rollouts, or in a single one, which is repeated; None = goal-free.
+        seed: Seed of the noise, the only random input of the rollouts.
+        context: Result of an earlier `policy.encode(batch)`; None = encode here.
+        goals: Goals of agents in each of the N rollouts, or in a single rollout to be repeated; None = goal-free.
         sampling: Temperature and truncation of every draw.
         choose: Function that picks decisions from a distribution, such as CAT-K's closest among the top K.
         force: Function called before every advance with the state and the step that the decision starts at; may impose
             states on agents.
-        observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error that
-            it raises ends the simulation.
+        observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error ends
+            the simulation.
         may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
 
     Returns:

@@ -102,7 +102,7 @@ class Rollouts:
     decision: Tensor
     """[B, N, A, L, *event]; as sampled, never recovered from poses."""
     decision_mask: Bool[Tensor, "B N A L"]
-    """True = the policy chose it. False for padding, for agents that decide nothing any more, such as those that have
+    """True = the policy decided. False for padding, for agents that decide nothing any more, such as those that have
     left the map, and where all steps of the decision were forced."""
     log_prob: Float[Tensor, "B N A L"]
     """Under the distribution that was sampled from, nats; 0 where the mask is False."""
@@ -156,11 +156,6 @@ class Rollouts:
             raise ConfigError(f"{cause}: these are rollouts of {listed}.")
         return 0 if scenario_id is None else ids.index(scenario_id)
 
-    def _find_scenario(self, scenario_id: str | None) -> Scenario:
-        row = self.find_row(scenario_id)
-        assert self.provenance is not None
-        return self.provenance.scenarios[row]
-
     def object_ids(self, scenario_id: str | None = None) -> Int64[np.ndarray, "A"]:
         """Object ids of a scenario's simulated agents, in the order of axis A; a scenario's padding has none.
 
@@ -170,7 +165,9 @@ class Rollouts:
         Raises:
             ConfigError: There is no such scenario, several to choose from, or no provenance.
         """
-        scenario = self._find_scenario(scenario_id)
+        row = self.find_row(scenario_id)
+        assert self.provenance is not None
+        scenario = self.provenance.scenarios[row]
         return scenario.tracks.object_id[scenario.simulated_indices]
 
     def trajectory(self, object_id: int, scenario_id: str | None = None) -> Float[Tensor, "N T 3"]:
@@ -183,8 +180,9 @@ class Rollouts:
         Raises:
             ConfigError: There is no such agent (the message lists the simulated ones) or no such scenario.
         """
-        row, ids, scenario = self.find_row(scenario_id), self.object_ids(scenario_id), self._find_scenario(scenario_id)
+        row, ids = self.find_row(scenario_id), self.object_ids(scenario_id)
         assert self.provenance is not None
+        scenario = self.provenance.scenarios[row]
         if object_id not in ids:
             listed = ", ".join(map(str, sorted(ids.tolist())))
             raise ConfigError(

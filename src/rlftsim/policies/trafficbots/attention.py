@@ -2,11 +2,11 @@
 
 out_i = W_o sum_j a_ij (v_j + W_v e_ij),  a_ij = softmax_j(q_i (k_j + W_k e_ij) / sqrt(d))
 
-for the neighbors j of token i, whose pose in its frame has the embedding e_ij. Source: Zhang et al., "Real-Time Motion
-Prediction via Heterogeneous Polyline Transformer with Relative Pose Encoding", NeurIPS 2023.
+for the neighbors j of token i, where e_ij is the embedding of j's pose in the frame of i. Source: Zhang et al.,
+"Real-Time Motion Prediction via Heterogeneous Polyline Transformer with Relative Pose Encoding", NeurIPS 2023.
 
 Shapes: S queries, M targets, K neighbors, H heads of width d, D = H d, E width of an embedding. `*g` are leading axes
-of the queries; those of the targets, `*h`, are the first ones of `*g`.
+of the queries; the targets' axes `*h` are the first of `*g`.
 """
 
 import math
@@ -76,7 +76,9 @@ class PoseAttention(nn.Module):
         logits = []
         for targets, neighbors in sources:
             # All pairs by one matrix product are cheaper than copies of each neighbor's key.
-            dense = _merge_rows(query, targets.keys) @ targets.keys.transpose(-1, -2)  # [*h, H, R, M]
+            # Axes of the queries that the keys do not have are merged into R rows.
+            merged = query.reshape(*targets.keys.shape[:-3], -1, *query.shape[-2:]).transpose(-2, -3)
+            dense = merged @ targets.keys.transpose(-1, -2)  # [*h, H, R, M]
             picked = dense.gather(-1, _merge_index(neighbors.index, dense))  # [*h, H, R, K]
             content = picked.transpose(-2, -3).reshape(*rows, heads, picked.shape[-1])  # [*g, S, H, K]
             pose = pose_query @ neighbors.embedding.transpose(-1, -2)
@@ -95,11 +97,6 @@ class PoseAttention(nn.Module):
             out = out + (dense @ targets.values.to(dense.dtype)).transpose(-2, -3).reshape(out.shape)
         out = self.out(out.masked_fill(is_alone, 0.0).flatten(-2))
         return out.masked_fill(is_alone[..., 0, :], 0.0)
-
-
-def _merge_rows(query: Float[Tensor, "*g S H d"], keys: Float[Tensor, "*h H M d"]) -> Float[Tensor, "*h H R d"]:
-    """Queries with all axes that the keys do not have merged into one."""
-    return query.reshape(*keys.shape[:-3], -1, *query.shape[-2:]).transpose(-2, -3)
 
 
 def _merge_index(index: Int64[Tensor, "*g S K"], dense: Float[Tensor, "*h H R M"]) -> Int64[Tensor, "*h H R K"]:
@@ -140,8 +137,8 @@ class SelfLayer(nn.Module):
         """Features after the layer, 0 for tokens that do not exist.
 
         Args:
-            x: Features of the tokens.
-            mask: True = the token exists.
+            x: Features of the tokens, D numbers each.
+            mask: True = the token exists; other tokens get features of 0.
             neighbors: Neighbors of each token among the tokens.
         """
         normal = self.norm(x)
@@ -176,8 +173,8 @@ class DecoderLayer(nn.Module):
         """Features after the layer, 0 for tokens that do not exist.
 
         Args:
-            x: Features of the tokens.
-            mask: True = the token exists.
+            x: Features of the tokens, D numbers each.
+            mask: True = the token exists; other tokens get features of 0.
             neighbors: Neighbors of each token among the tokens.
             sources: Targets of other types, from this layer's `project`, and the tokens' neighbors among these.
         """

@@ -3,8 +3,6 @@
 Frame: ego. Shapes: A agents, M map tokens.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -26,13 +24,14 @@ LOOKAHEAD_S = 5.0
 MAX_WALK_LANES = 3
 
 
-@dataclass(frozen=True, eq=False)
 class Nodes:
     """Nodes of the map tokens of given types."""
 
-    token: Int64[np.ndarray, "n"]
-    position: Float64[np.ndarray, "n 2"]
-    direction: Float64[np.ndarray, "n 2"]
+    def __init__(self, tokens: MapTokens, types: tuple[int, ...]):
+        mask: Bool[np.ndarray, "M 20"] = tokens.node_mask & np.isin(tokens.type, types)[:, None]
+        self.token = np.nonzero(mask)[0]  # [n]
+        self.position = tokens.position[mask][:, :2]
+        self.direction = tokens.direction[mask][:, :2]
 
     def nearest(self, point: Float64[np.ndarray, "2"]) -> int:
         """Token of the nearest node; `NO_DESTINATION` without nodes."""
@@ -44,8 +43,8 @@ class Nodes:
         """Token of the nearest node within reach that runs in a direction; `NO_DESTINATION` without such a node.
 
         Args:
-            point: x and y, m, ego frame.
-            heading: Direction in rad; a node's direction differs from it by less than 90 degrees.
+            point: Position x and y, m, ego frame.
+            heading: Direction in rad; directions of nodes differ by less than 90 degrees.
         """
         distance = np.linalg.norm(self.position - point, axis=1)
         is_aligned = self.direction @ np.array([np.cos(heading), np.sin(heading)]) > 0
@@ -59,9 +58,9 @@ class DestinationMap:
     def __init__(self, map_tokens: MapTokens, successors: dict[int, list[int]]):
         self.map_tokens = map_tokens
         self.successors = successors
-        self.vehicle_lanes = _select_nodes(map_tokens, VEHICLE_LANES)
-        self.bike_lanes = _select_nodes(map_tokens, (MapTokenType.BIKE_LANE,))
-        self.edges = _select_nodes(map_tokens, (MapTokenType.EDGE_BOUNDARY,))
+        self.vehicle_lanes = Nodes(map_tokens, VEHICLE_LANES)
+        self.bike_lanes = Nodes(map_tokens, (MapTokenType.BIKE_LANE,))
+        self.edges = Nodes(map_tokens, (MapTokenType.EDGE_BOUNDARY,))
         is_lane = np.isin(map_tokens.type, VEHICLE_LANES)
         self.last_tokens = {int(id_): int(k) for k, id_ in enumerate(map_tokens.feature_id) if is_lane[k]}
 
@@ -69,7 +68,7 @@ class DestinationMap:
         """Tokens that an agent may be heading for, with probabilities; empty if there are none.
 
         Args:
-            last: x, y, heading and speed at the agent's last logged step, ego frame.
+            last: Position x and y, heading and speed at the agent's last logged step, ego frame.
             agent_class: Class of the agent: 0 vehicle, 1 pedestrian, 2 cyclist.
         """
         heading, speed = last[2:]
@@ -137,9 +136,3 @@ def _successors(scenario: Scenario) -> dict[int, list[int]]:
     graph = lane_graph(scenario)
     ids = graph.lane_id.tolist()
     return {ids[k]: [ids[j] for j in successors] for k, successors in enumerate(graph.successors)}
-
-
-def _select_nodes(tokens: MapTokens, types: tuple[int, ...]) -> Nodes:
-    mask: Bool[np.ndarray, "M 20"] = tokens.node_mask & np.isin(tokens.type, types)[:, None]
-    index = np.broadcast_to(np.arange(len(tokens))[:, None], mask.shape)[mask]
-    return Nodes(index, tokens.position[mask][:, :2], tokens.direction[mask][:, :2])

@@ -54,7 +54,7 @@ def reaches_destination(
     """True = near a lane and in its direction, or near an edge.
 
     Args:
-        pose: Poses of the agents.
+        pose: Poses of the agents, ego frame, m and rad.
         destination: Map token of each agent's destination, at least 0.
         scene: Scene with the map.
     """
@@ -76,7 +76,7 @@ def leaves_map(pose: Float[Tensor, "B N A 3"], scene: Scene) -> Bool[Tensor, "B 
     """True = outside of the map's bounding box.
 
     Args:
-        pose: Poses of the agents.
+        pose: Poses of the agents, ego frame, m and rad.
         scene: Scene with the map; without a map no agent leaves.
     """
     x_min, x_max, y_min, y_max = scene.map_box[:, None, None].unbind(-1)

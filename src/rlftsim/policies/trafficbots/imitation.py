@@ -33,7 +33,6 @@ from rlftsim.policies.trafficbots.network import (
     history_windows,
 )
 from rlftsim.policies.trafficbots.scene import Scene, build_scene
-from rlftsim.policies.trafficbots.scoring import compute_features
 from rlftsim.policies.trafficbots.state import ImposedStates, join_history, start_traffic
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.scenario.batch import ScenarioBatch
@@ -71,7 +70,7 @@ def imitation_loss(
         network: Network with the weights. In training mode inputs are hidden and agents forced by schedule; in
             evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
         config: Settings with the schedule of forcing, and probabilities.
-        batch: Scenarios with logged futures.
+        batch: Scenarios with logged futures, the targets of imitation.
         trained: True = the agent counts; other agents are context.
         update: Number of the update of pre-training from 0.
     """
@@ -122,7 +121,7 @@ def compute_scene_loss(
     """Loss of a scene with random values that have been drawn.
 
     Args:
-        network: Network with the weights.
+        network: Network with the weights to be trained.
         config: Settings with `free_nats` and `steps_per_pass`.
         scene: Scene with all 91 steps of the log.
         destination: Label of each agent, a map token; negative = none.
@@ -132,7 +131,9 @@ def compute_scene_loss(
     # 1. Map, lights along the log, personality, destination: all with gradient.
     map_features = network.map(scene, draws.node_mask)
     light_features, light_loss = _lights_along_log(network, scene, map_features)
-    mean = network.posterior(*_posterior_inputs(scene), scene, map_features)
+    steps = slice(0, TOTAL_STEPS, POSTERIOR_STRIDE)
+    windows = Windows(scene.valid, scene.pose, scene.motion).apply(lambda v: v[:, None, None, :, steps])
+    mean = network.posterior(windows, scene.light_state[:, None, :, steps], scene, map_features)
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
     conditioning = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
@@ -141,8 +142,8 @@ def compute_scene_loss(
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
     rollout = _roll_out(network, scene, context, conditioning, destination[:, None], draws.forced)
     value, grad = _differentiate_actions(scene, rollout, trained)
-    features = compute_features(
-        network, rollout.history, rollout.active, scene, context, conditioning, steps_per_pass=config.steps_per_pass
+    features = network.features_over_time(
+        rollout.history, rollout.active, scene, context, conditioning, steps_per_pass=config.steps_per_pass
     )  # [B, T, 1, A, D]
     actions = network.mean_actions(features, scene).movedim(1, 3)  # [B, 1, A, T, 2]
     surrogate = (actions * grad).sum()
@@ -273,13 +274,6 @@ def _lights_along_log(
     target = scene.light_state[:, :, 1:].transpose(1, 2)[..., None]  # [B, 90, L, 1]
     loss = -log_prob.gather(-1, target)[..., 0]
     return features, _average_by_scenario(loss, scene.light_mask[:, None].expand_as(loss))
-
-
-def _posterior_inputs(scene: Scene) -> tuple[Windows, Int64[Tensor, "B 1 L 19"]]:
-    """Every fifth step of the log: agents [B, 1, 1, A, 19] and lights."""
-    steps = slice(0, TOTAL_STEPS, POSTERIOR_STRIDE)
-    windows = Windows(scene.valid, scene.pose, scene.motion).apply(lambda v: v[:, None, None, :, steps])
-    return windows, scene.light_state[:, None, :, steps]
 
 
 def _average_by_scenario(values: Float[Tensor, "B *g"], mask: Bool[Tensor, "B *g"]) -> Float[Tensor, ""]:

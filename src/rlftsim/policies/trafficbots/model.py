@@ -47,12 +47,12 @@ class TrafficBotsModel(nn.Module):
     def head_modules(self) -> tuple[nn.Module, ...]:
         """The last layer that decides how vehicles accelerate.
 
-        Rollouts say next to nothing of yaw rate, whose noise is narrow: training it would be a random walk.
+        Yaw rates have so narrow a noise that rollouts hardly tell good from bad: training would be a random walk.
         """
         return (self.network.actions.acceleration[VEHICLE],)
 
     def shares_scene_features(self, model: nn.Module) -> bool:
-        """True if map and lights have the same features in another model, without gradient in both.
+        """True if map and lights have the same features in a model, without gradient in both.
 
         Args:
             model: Model of any class; only the same class, settings and weights give True.
@@ -60,7 +60,7 @@ class TrafficBotsModel(nn.Module):
         return self._shares_weights(model, lambda name: name.startswith(("map.", "lights.", "light_state.")))
 
     def shares_agent_features(self, model: nn.Module) -> bool:
-        """True if another model decides actions by the same features, without gradient in both.
+        """True if a model decides actions by the same features, without gradient in both.
 
         Args:
             model: Model of any class; only the same class, settings and weights give True.
@@ -92,7 +92,7 @@ class TrafficBotsModel(nn.Module):
     def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
         """Features of the lights at all 80 decisions; each next state is the most likely state.
 
-        Lights do not see agents, so that they are the same in all rollouts of a scene.
+        Lights do not see agents, so that the features are the same in all rollouts of a scene.
         """
         encoder = self.network.lights
         neighborhoods = encoder.neighborhoods(scene, map_features)
@@ -127,7 +127,7 @@ class TrafficBotsModel(nn.Module):
 
         Raises:
             ConfigError: There is no such folder, or the settings are contradictory.
-            CheckpointError: A file is missing or damaged, the architecture is another, or keys and shapes do not fit;
+            CheckpointError: A file is missing or damaged, the architecture is different, or keys and shapes do not fit;
                 the message names the first.
         """
         stored = read_model(folder, architecture=cls.architecture)

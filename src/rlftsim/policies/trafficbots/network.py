@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from rlftsim.policies.precision import at_least_float32
 from rlftsim.policies.trafficbots.attention import DecoderLayer, KeyValues, PolylineEncoder, SelfLayer
@@ -138,7 +139,7 @@ class LightEncoder(nn.Module):
 
         Args:
             scene: Scene with lights and map.
-            map_features: Features from `MapEncoder`; receive no gradient from lights.
+            map_features: Features of the map tokens, from `MapEncoder`; receive no gradient from lights.
         """
         config, map_features = self.config, map_features.detach()
         lights = scene.light_pose
@@ -195,7 +196,7 @@ class Windows:
 
     @property
     def token_mask(self) -> Bool[Tensor, "*g A"]:
-        """True = there is a valid step, so that other agents attend to this one."""
+        """True = there is a valid step, so that other agents attend to this agent."""
         return self.valid.any(-1)
 
     @property
@@ -353,7 +354,7 @@ class DestinationPredictor(nn.Module):
         Args:
             windows: History [B, A, W] of the agents.
             scene: Scene with map and agents.
-            map_features: Features from `MapEncoder`; receive no gradient from the predictor.
+            map_features: Features of the map tokens, from `MapEncoder`; receive no gradient from the predictor.
             step_mask: Steps to look at; None = all valid steps.
         """
         agents = self.windows(windows, agent_attributes(scene), step_mask)  # [B, A, D]
@@ -428,7 +429,7 @@ class Posterior(nn.Module):
         scene: Scene,
         map_features: Float[Tensor, "B M D"],
     ) -> Float[Tensor, "B A 16"]:
-        """Means of a diagonal Gaussian whose log standard deviations are `log_std`.
+        """Means of a diagonal Gaussian with log standard deviations `log_std`.
 
         Args:
             windows: Windows [B, 1, 1, A, 19] of every fifth step of the log.
@@ -481,7 +482,7 @@ class TrafficBotsNetwork(nn.Module):
 
         Args:
             scene: Scene with the map.
-            map_features: Features from `MapEncoder`; receive no gradient from here.
+            map_features: Features of the map tokens, from `MapEncoder`; receive no gradient from here.
             personality: Personality of each agent, 16 numbers.
             destination: Map token of each agent, negative = none.
         """
@@ -518,6 +519,43 @@ class TrafficBotsNetwork(nn.Module):
         pose = self.destination_pose(pose_embedding(relative, x.shape[-1]))
         x = self.add_destination(x, conditioning.destination_feature[:, None] + pose, active)
         return self.add_personality(x, conditioning.personality[:, None])
+
+    def features_over_time(
+        self,
+        history: Windows,
+        active: Bool[Tensor, "B N A T"],
+        scene: Scene,
+        context: AgentContext,
+        conditioning: AgentConditioning,
+        *,
+        steps_per_pass: int,
+    ) -> Float[Tensor, "B T N A D"]:
+        """`features` at all decisions of finished rollouts, in a few parallel passes; differentiable.
+
+        The network has no state: a decision depends on the last 11 steps alone.
+
+        Args:
+            history: Agents [B, N, A, W - 1 + T] from the first step of the first decision's window on.
+            active: True = the agent has not reached the destination yet at this decision.
+            scene: Scene with map, lights, sizes and classes.
+            context: Map, and lights at the same T decisions.
+            conditioning: Personality and destination of each agent.
+            steps_per_pass: Number of decisions in memory at once with gradient; changes memory and time only.
+        """
+        # [B, N, A, T, ..., W] -> [B, T, N, A, W, ...]
+        windows = history.apply(lambda v: v.unfold(3, WINDOW, 1).movedim(3, 1).movedim(-1, 4))
+        passes = [slice(start, start + steps_per_pass) for start in range(0, active.shape[-1], steps_per_pass)]
+        features = []
+        for steps in passes:
+            selected = windows.apply(lambda v, steps=steps: v[:, steps])
+            inputs = (selected, scene, context.select_steps(steps), conditioning, active.movedim(3, 1)[:, steps])
+            if torch.is_grad_enabled() and len(passes) > 1:
+                # Each pass is computed again in the backward pass, so that memory holds a single pass.
+                result = checkpoint(self.features, *inputs, use_reentrant=False, preserve_rng_state=False)
+            else:
+                result = self.features(*inputs)
+            features.append(cast(Tensor, result))
+        return torch.cat(features, 1)
 
     def mean_actions(self, features: Float[Tensor, "B T N A D"], scene: Scene) -> Float[Tensor, "B T N A 2"]:
         """Means of the actions before tanh, in float32 or better: what an agent does without exploration noise.

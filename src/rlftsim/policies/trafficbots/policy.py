@@ -1,6 +1,6 @@
 """TrafficBots as a policy: every agent chooses an acceleration and a yaw rate, eighty times.
 
-The network gives the mean mu_t of an action u_t (before tanh). The noise around it is correlated in time:
+The network gives the mean mu_t of an action u_t (before tanh). The noise around the mean is correlated in time:
 
     u_t | past ~ N(mu_t + rho (u_{t-1} - mu_{t-1}), (1 - rho^2) sigma^2),   at first N(mu_t, sigma^2)
 
@@ -24,7 +24,6 @@ from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
 from rlftsim.policies.trafficbots.network import NUM_CLASSES, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.scoring import compute_features
 from rlftsim.policies.trafficbots.state import (
     Memo,
     TrafficBotsContext,
@@ -71,8 +70,8 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """The current step, N times, with a personality and a destination for each agent.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            num_rollouts: Number N of simulations of each scenario.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            num_rollouts: Number N of simulations of each scenario, all in a single state.
             goals: Goals of agents, ignored: TrafficBots draws destinations.
             noise: Uniform numbers in [0, 1): 16 for the personality, the last for the destination.
         """
@@ -92,7 +91,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """The current step, with personalities and destinations that have been drawn.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             draws: Personality (16 numbers) and map token of the destination, -1 = none.
         """
         personality, destination = draws[..., :LATENT_SIZE], draws[..., LATENT_SIZE].long()
@@ -103,7 +102,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Distributions [B, N, A] of the next action.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             state: State before the decision; the memo in it is filled.
         """
         mean, residual = self._compute_mean(context, state), None
@@ -121,7 +120,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """State after 0.1 s of the chosen actions.
 
         Args:
-            context: Context of the scenarios, from `encode`.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
             state: State before the decision.
             decision: Actions before tanh: acceleration and yaw rate.
             forced: States of a single step imposed from outside; None = no agent is forced.
@@ -153,8 +152,8 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Distributions [B, N, A, T] along rollouts, in parallel over time.
 
         Args:
-            context: Context of the scenarios, from `encode`.
-            rollouts: Rollouts of the same scenarios.
+            context: Context of the scenarios, from `encode`, shared by all rollouts.
+            rollouts: Rollouts of the same scenarios, with decisions, forced states and draws.
         """
         replay = self._replay(context, rollouts)
         return self._score_states(context, replay, rollouts.decision, self._compute_features(context, replay))
@@ -177,12 +176,11 @@ class TrafficBotsPolicy(TrafficBotsModel):
     ) -> tuple[GaussianDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
-        The features of agents are computed once where only `actions` differs, and not at all along rollouts that the
-        context has a record of.
+        The features of agents are computed once where only `actions` differs, and never along recorded rollouts.
 
         Args:
             context: Context of the scenarios under this policy.
-            rollouts: Rollouts of the same scenarios.
+            rollouts: Rollouts of the same scenarios, with decisions, forced states and draws.
             reference: Policy of any class, scored without gradient.
             ref_context: Context of the scenarios under the reference.
             ref_rollouts: The same rollouts, maybe with goals, which TrafficBots ignores.
@@ -204,7 +202,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Loss of closed-loop imitation.
 
         Args:
-            scenarios: Scenarios with logged futures.
+            scenarios: Scenarios with logged futures, the targets of imitation.
             trained: True = the agent counts; other agents are context.
             update: Number of the update from 0; in training mode the fraction of agents that follow the log falls.
         """
@@ -228,9 +226,9 @@ class TrafficBotsPolicy(TrafficBotsModel):
     ) -> Float[Tensor, "B T N A D"]:
         """Features of agents in each of T states."""
         traffic = [state.traffic for state in states]
-        return compute_features(
-            self.network, join_history(traffic), torch.stack([t.active for t in traffic], 3), context.scene,
-            context.agent_context, states[0].conditioning, steps_per_pass=self.config.steps_per_pass,
+        return self.network.features_over_time(
+            join_history(traffic), torch.stack([t.active for t in traffic], 3), context.scene, context.agent_context,
+            states[0].conditioning, steps_per_pass=self.config.steps_per_pass,
         )  # fmt: skip
 
     def _score_states(

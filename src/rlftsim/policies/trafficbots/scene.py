@@ -1,7 +1,7 @@
-"""A batch of scenarios as padded tensors in their ego frames: the network's input, float32 as it is built.
+"""A batch of scenarios as padded tensors in ego frames: the network's input, float32 as built.
 
-Shapes: B scenarios, M map tokens, L light tokens, A agents, S steps of 0.1 s. There is always at least one map token
-and one light token, which may be padding.
+Shapes: B scenarios, M map tokens, L light tokens, A agents, S steps of 0.1 s. M and L are at least 1: a scenario
+without tokens has padding.
 """
 
 from collections.abc import Sequence
@@ -52,12 +52,12 @@ class Scene:
 
     @property
     def map_pose(self) -> Float[Tensor, "B M 3"]:
-        """Pose of each map token, that of its first node."""
+        """Pose of each map token: the pose of the first node."""
         return self.node_pose[..., 0, :]
 
     @property
     def light_pose(self) -> Float[Tensor, "B L 3"]:
-        """Pose of each light, that of its map token."""
+        """Pose of each light: the pose of the light's map token."""
         return self.map_pose.gather(1, self.light_token[..., None].expand(-1, -1, 3))
 
     def to(self, device: torch.device) -> "Scene":
@@ -76,7 +76,7 @@ class Scene:
 
 
 def build_scene(batch: ScenarioBatch, num_steps: int, max_map_tokens: int | None) -> Scene:
-    """Scene of a batch, on its device.
+    """Scene of a batch, on the batch's device.
 
     Args:
         batch: Scenarios with at least `num_steps` logged steps.
