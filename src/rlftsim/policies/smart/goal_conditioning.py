@@ -81,10 +81,8 @@ class GoalEmbedding(FourierEmbedding):
 
     def zero_init(self) -> None:
         """Zero the last map: the embedding of any goal is zero."""
-        last = self.out[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        for weight in self.out[-1].parameters():
+            nn.init.zeros_(weight)
 
     @torch.no_grad()
     def init_from(self, relation: FourierEmbedding) -> None:
@@ -174,28 +172,19 @@ class GoalLogitBias(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(len(CLASS_NAMES), NUM_DECISIONS, 3))
 
-    def zero_init(self) -> None:
-        """Zero the weights: no bias."""
-        nn.init.zeros_(self.weight)
-
     def forward(
-        self,
-        goal: Float[Tensor, "g 2"],
-        num_left: Int64[Tensor, "g"],
-        class_id: Int64[Tensor, "g"],
-        moves: Float[Tensor, "C V 2"],
+        self, features: Float[Tensor, "g 3 V"], num_left: Int64[Tensor, "g"], class_id: Int64[Tensor, "g"]
     ) -> Float[Tensor, "g V"]:
-        """Bias of the logits of all tokens; differentiable in the weights, by the features of `suitability`.
+        """Bias of the logits of all tokens, differentiable in the weights.
 
         Args:
-            goal: Goal of each row, meters, in the frame of its agent.
+            features: Features of each token, from `suitability`.
             num_left: Number of decisions left, the next included, from 1 to 16.
             class_id: Agent class that each row's token ids refer to.
-            moves: Displacement by each token, meters, in the agent's frame.
         """
         weights = BIAS_GAIN * self.weight[class_id, num_left - 1]  # [g, 3]
-        with torch.autocast(goal.device.type, enabled=False):  # logits are float32
-            return (weights[:, None] @ suitability(goal, num_left, class_id, moves))[:, 0]
+        with torch.autocast(features.device.type, enabled=False):  # logits are float32
+            return (weights[:, None] @ features)[:, 0]
 
     def apply_to(
         self,
@@ -224,7 +213,8 @@ class GoalLogitBias(nn.Module):
         goal = rotate(goals.position[rows[:3]] - pose.position, -pose.heading)  # [g, 2], agent's frame
         row_class = class_id[rows[0], rows[2]]
         # a token's displacement is the mean of the four corners of its last box
-        bias = self(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))  # [g, V]
+        features = suitability(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))
+        bias = self(features, num_left[rows], row_class)  # [g, V]
         # tokens of other classes stay impossible
         is_biased = vocabulary.token_mask[row_class] & has_goal[conditioned, None]
         return TokenDistribution(dist.logits.index_add(0, conditioned, bias.masked_fill(~is_biased, 0.0)), dist.mask)

@@ -36,17 +36,16 @@ class ClassHeads(nn.ModuleList):
             class_id: Class of each agent, an index into the heads; rows of padding classes are arbitrary.
         """
         logits = torch.full((len(features), self.num_tokens), NEVER, device=features.device)
-        if features.device.type != "cpu":
-            # each head sees all rows: to leave some out, the host would wait for their number
-            for index, (head, size) in enumerate(zip(self, self.class_sizes)):
+        for index, (head, size) in enumerate(zip(self, self.class_sizes)):
+            if features.device.type == "cpu":
+                # each head sees the rows of a single class
+                rows = (class_id == index).nonzero()[:, 0]
+                logits[rows, :size] = head(features[rows]).float()
+            else:
+                # each head sees all rows: to leave some out, the host would wait for their number
                 class_logits = functional.pad(head(features).float(), (0, self.num_tokens - size), value=NEVER)
                 # padding, whose class has no head, gets arbitrary logits
                 logits = torch.where((class_id >= index)[:, None], class_logits, logits)
-            return logits
-        for index, (head, size) in enumerate(zip(self, self.class_sizes)):
-            # each head sees the rows of its class only
-            rows = (class_id == index).nonzero()[:, 0]
-            logits[rows, :size] = head(features[rows]).float()
         return logits
 
 

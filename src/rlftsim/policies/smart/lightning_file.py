@@ -7,7 +7,6 @@ Such files are pickles, read through torch's restricted unpickler. The few forei
 import collections
 import typing
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +40,8 @@ _HARMLESS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class LightningFile:
-    """Weights and settings of a Lightning checkpoint."""
-
-    weights: dict[str, Tensor]
-    settings: dict[str, Any]
-    """The file's `hyper_parameters` as plain dictionaries, lists and values; empty where there are none."""
-
-
-def read_lightning(path: Path) -> LightningFile:
-    """Read weights and settings of a Lightning checkpoint.
+def read_lightning(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights of a Lightning checkpoint, and the file's `hyper_parameters` as plain dictionaries, lists and values.
 
     Raises:
         CheckpointError: No such file, not a checkpoint, no weights inside, or objects that would have to run code to
@@ -65,7 +55,7 @@ def read_lightning(path: Path) -> LightningFile:
         settings = _plain(content.get("hyper_parameters", {}))
     except RecursionError:
         raise CheckpointError(f"{path}: damaged, its settings hold themselves: get the file again.") from None
-    return LightningFile(dict(weights), settings if isinstance(settings, dict) else {})
+    return dict(weights), settings if isinstance(settings, dict) else {}
 
 
 def find_group(settings: dict[str, Any], name: str) -> dict[str, Any]:

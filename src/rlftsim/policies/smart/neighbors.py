@@ -109,7 +109,11 @@ def find_neighbors(
     cut = _patches if is_on_cpu and num_candidates >= MANY_CANDIDATES else _blocks
     lists = []
     for view in cut(position, set_index, candidates, radius_m):
-        squared = _squared_distances(view, position, self_index)
+        # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
+        squared = (view.x - position[view.rows, :1]).square_()
+        squared += (view.y - position[view.rows, 1:]).square_()
+        if self_index is not None:
+            squared.masked_fill_(view.columns == self_index[view.rows, None], torch.inf)
         if limit is not None:
             neighbors = _select_nearest(squared, radius_m, limit)
         elif is_on_cpu:
@@ -162,18 +166,6 @@ class View:
     y: Float[Tensor, "_ c"]
 
 
-def _squared_distances(
-    view: View, position: Float[Tensor, "R 2"], self_index: Int64[Tensor, "R"] | None
-) -> Float[Tensor, "r c"]:
-    """Squared distances between rows and candidates of a view, infinite from a row to itself."""
-    # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
-    squared = (view.x - position[view.rows, :1]).square_()
-    squared += (view.y - position[view.rows, 1:]).square_()
-    if self_index is not None:
-        squared.masked_fill_(view.columns == self_index[view.rows, None], torch.inf)
-    return squared
-
-
 def _blocks(
     position: Float[Tensor, "R 2"], set_index: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
 ) -> Iterator[View]:
@@ -222,10 +214,10 @@ def _select_nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) 
 
 def _select_within(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
     """All candidates within the radius, in the order of their columns."""
-    is_near = squared < radius_m**2
-    count = is_near.sum(-1, keepdim=True)
-    column = is_near.nonzero()[:, 1]  # of all rows, one row after the other
-    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=is_near.device)
+    is_inside = squared < radius_m**2
+    count = is_inside.sum(-1, keepdim=True)
+    column = is_inside.nonzero()[:, 1]  # of all rows, one row after the other
+    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=is_inside.device)
     mask = columns < count
     # position of each list's entries among these; padding repeats any
     entry = (count.cumsum(0) - count + columns).clamp(max=max(len(column) - 1, 0))
@@ -234,15 +226,15 @@ def _select_within(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
 
 def _select_bounded(squared: Float[Tensor, "r C"], radius_m: float, max_neighbors: int | None) -> Neighbors:
     """As `_select_within`, in lists of `max_neighbors` entries; without that bound the host waits for the count."""
-    is_near = squared < radius_m**2
-    columns = torch.arange(squared.shape[1], device=is_near.device).expand(is_near.shape)
-    width = int(is_near.sum(-1).max()) if max_neighbors is None else max_neighbors
+    is_inside = squared < radius_m**2
+    columns = torch.arange(squared.shape[1], device=is_inside.device).expand(is_inside.shape)
+    width = int(is_inside.sum(-1).max()) if max_neighbors is None else max_neighbors
     if width >= squared.shape[1]:
-        return Neighbors(columns, is_near)
-    count = is_near.cumsum(-1)
+        return Neighbors(columns, is_inside)
+    count = is_inside.cumsum(-1)
     # the first neighbor goes to the first entry, and so on; all others to one more entry, which is cut off
-    index = columns.new_zeros(len(is_near), width + 1)
-    index.scatter_(1, torch.where(is_near, count - 1, width), columns)
+    index = columns.new_zeros(len(is_inside), width + 1)
+    index.scatter_(1, torch.where(is_inside, count - 1, width), columns)
     return Neighbors(index[:, :width], columns[:, :width] < count[:, -1:])
 
 

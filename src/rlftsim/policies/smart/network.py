@@ -449,8 +449,8 @@ class SmartNetwork(nn.Module):
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self, config.frequency_init)
-        for module in self.decoder.goal_modules():
-            module.zero_init()
+        if self.decoder.goal is not None:
+            self.decoder.goal.zero_init()
 
     def scene_weights(self) -> list[Tensor]:
         """Weights that scenes and views are made with: all but those of the decoder's `reader_modules`."""
