@@ -1,4 +1,4 @@
-"""Token distributions with a weighted sum of features on their logits.
+"""Token distributions with a weighted sum of features on the logits.
 
 R elements, P pairs of an element and a candidate token, K features, V tokens.
 """
@@ -21,7 +21,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 
 @dataclass(frozen=True, eq=False)
 class TiltedDistribution(CategoricalDistribution):
-    """p(token) proportional to base(token) exp(eta · f(state, token)); the base itself, bit for bit, where eta is 0.
+    """p(token) proportional to base(token) exp(eta · f(state, token)); the base, bit for bit, where eta is 0.
 
     Features are 0 for tokens that are no candidates, see `Candidates`.
     """

@@ -1,11 +1,11 @@
-"""Features of a state and a token, by name. A calibrated policy adds a weighted sum of some of them to its logits.
+"""Features of a state and a token, by name. A calibrated policy adds a weighted sum of selected features to the logits.
 
     @register_feature("braking", low=-1.5, high=0.0)
     def braking(candidates: Candidates) -> Float[Tensor, "P"]:
         return candidates.speed_change * candidates.where(candidates.is_vehicle)
 
-A feature is one function on tensors, of all pairs of agents and tokens at once, and has bounds, to which its values
-are clipped: without bounds rare tokens with an extreme value would win. A feature is computed before the decision, and
+A feature is a function on tensors, of all pairs of agents and tokens at once, and has bounds, to which values are
+clipped: without bounds rare tokens with an extreme value would win. A feature is computed before the decision, and
 may not read the logged future. A separate package announces features as entry points:
 
     [project.entry-points."rlftsim.features"]
@@ -119,7 +119,7 @@ def turn_to_lane_direction(c: Candidates) -> Float[Tensor, "P"]:
 
 @register_feature("turn_to_lane_center", low=-2.0, high=2.0)
 def turn_to_lane_center(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of turn times the lateral offset of the lane's center; positive = towards it."""
+    """Change of turn times the lateral offset of the lane's center; positive = towards the center."""
     return 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)
 
 

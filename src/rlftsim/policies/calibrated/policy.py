@@ -1,4 +1,4 @@
-"""A policy with a vocabulary, calibrated: eta · f(state, token) on its logits, with features f that have names.
+"""A policy with a vocabulary, calibrated: eta · f(state, token) on the logits, with named features f.
 
 B scenarios, N rollouts, A agents, L decisions, K features.
 """
@@ -116,7 +116,7 @@ class CalibratedPolicy(nn.Module):
         return self._calibration
 
     def set_calibration(self, eta: Tensor, calibration: Mapping[str, Any]) -> None:
-        """Set fitted weights, and the account of how they were fitted.
+        """Set fitted weights, and the account of the fit.
 
         Args:
             eta: Weights [K], in the order of the features.
@@ -240,7 +240,7 @@ class CalibratedPolicy(nn.Module):
 
     @classmethod
     def from_pretrained(cls, folder: str | os.PathLike) -> "CalibratedPolicy":
-        """Policy of a model folder as `save_pretrained` writes it.
+        """Policy of a model folder as written by `save_pretrained`.
 
         Raises:
             ConfigError: There is no such folder, or a feature is not registered here.

@@ -35,7 +35,7 @@ class Segments:
     delta: Float[Tensor, "S 2"]
 
     def to(self, device: torch.device | str) -> "Segments":
-        """Copy on another device."""
+        """Copy on a device."""
         return Segments(self.start.to(device), self.delta.to(device))
 
     def find_nearest(
@@ -45,7 +45,7 @@ class Segments:
 
         Args:
             position: Positions to look from, map frame, meters.
-            heading: Headings at the positions, so that segments of another direction count as farther away; None = any
+            heading: Headings at the positions, so that segments of different direction count as farther away; None = any
                 direction.
 
         Returns:
@@ -83,7 +83,7 @@ def cut_segments(scenario: Scenario, types: tuple[int, ...], frame: Frame) -> Se
     """Segments of a scenario's map features; None where there are none.
 
     Args:
-        scenario: Scenario whose map, in the world frame, is cut.
+        scenario: Scenario with the map to cut, in the world frame.
         types: `MapFeatureType` numbers of the features to cut.
         frame: Frame of the segments, "map" or "world".
     """
@@ -105,7 +105,7 @@ def cut_segments(scenario: Scenario, types: tuple[int, ...], frame: Frame) -> Se
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Agents of several scenes at one or more moments before their decisions, with the motion that led there."""
+    """Agents of several scenes at one or more moments before decisions, with the motion that led there."""
 
     position: Float[Tensor, "B N A L 2"]
     heading: Float[Tensor, "B N A L"]
@@ -157,7 +157,7 @@ def build_scene(batch: ScenarioBatch) -> Scene:
     """The scene of a batch: history, boxes and map. The logged future is not read.
 
     Args:
-        batch: Scenarios of one frame, with history, boxes and maps.
+        batch: Scenarios in a common frame, with history, boxes and maps.
     """
     logged = (batch.position, batch.heading, batch.velocity)
     position, heading, velocity = (values[:, None, :, CURRENT_STEP, None] for values in logged)  # [B, 1, A, 1, ...]

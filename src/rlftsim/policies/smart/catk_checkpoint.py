@@ -51,7 +51,7 @@ _HEAD_BIAS = PREFIX + "agent_encoder.token_predict_head.mlp.3.bias"
 
 @dataclass(frozen=True, eq=False)
 class CatkImport:
-    """An imported model, its size and its origin."""
+    """An imported model, with size and origin."""
 
     policy: SmartPolicy
     size: str
@@ -94,7 +94,7 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
 
 def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
-    """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits.
+    """Copies of a model's weights under the public code's names, on the CPU; a second import gives the same bits.
 
     Raises:
         CheckpointError: The model is goal-conditioned, or has a head that the public code lacks.
@@ -175,7 +175,7 @@ def _vocabulary_note(settings: dict[str, Any], is_published: bool, path: Path) -
     """Note on the vocabulary: published or not, and the file that the checkpoint names.
 
     Raises:
-        CheckpointError: The checkpoint names the published table, and this is another.
+        CheckpointError: The checkpoint names the published table, and the vocabulary is a different table.
     """
     named = find_group(settings, "token_processor").get("agent_token_file")
     if named == PUBLISHED_AGENT_FILE and not is_published:

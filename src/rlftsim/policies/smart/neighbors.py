@@ -1,6 +1,6 @@
 """Neighbor search: padded lists of sources within a radius, and the geometry of each relation.
 
-R rows that attend, K neighbors of a row, P sets of C candidates each. Lists are padded where their mask is False. A
+R rows that attend, K neighbors of a row, P sets of C candidates each. Lists are padded where the mask is False. A
 set holds the candidates of a scenario, or of a scenario, rollout and step: a row has neighbors in a single set.
 """
 
@@ -67,7 +67,7 @@ class RowGroups:
 
 
 def group_rows(set_index: Int64[Tensor, "R"], poses: Poses) -> RowGroups:
-    """Groups of rows whose candidate set and pose are equal to the last bit; on the CPU.
+    """Groups of rows with candidate set and pose equal to the last bit; on the CPU.
 
     Args:
         set_index: Candidate set of each row, an index into the first axis of the candidates.
@@ -90,20 +90,20 @@ def find_neighbors(
     limit: int | None,
     max_neighbors: int | None = None,
 ) -> Neighbors:
-    """Candidates nearer than a radius (strictly), or the nearest of them where a limit binds.
+    """Candidates nearer than a radius (strictly), or the nearest where a limit binds.
 
-    Of equally near candidates the first counts. Lists have at least one entry (K >= 1), padding where no row has a
+    Of equally near candidates the first counts. Lists have entries (K >= 1), padding where no row has a
     neighbor.
 
     Args:
         position: Finite positions of the rows, meters, in the frame of the candidates.
         set_index: Candidate set of each row, an index into the first axis of the candidates.
-        candidates: Positions, meters, infinite for padding. Neighbors are named by their flat index p * C + c.
-        self_index: Candidate of the set that is the row itself, and no neighbor; None = no row is a candidate.
+        candidates: Positions, meters, infinite for padding. Neighbors are named by the flat index p * C + c.
+        self_index: Candidate of the set that is the row, and no neighbor; None = no row is a candidate.
         radius_m: Radius of the circle around a row in which neighbors lie, meters.
-        limit: Largest number of neighbors of a row, the nearest of them; None = all within the radius.
+        limit: Largest number of neighbors of a row, the nearest candidates; None = all within the radius.
         max_neighbors: Bound on the candidates within the radius of a row, see `bound_neighbors`. Off the CPU lists are
-            then as wide, and the host need not wait for their width.
+            then as wide, and the host need not wait for the width.
     """
     num_candidates, is_on_cpu = candidates.shape[1], position.device.type == "cpu"
     cut = _patches if is_on_cpu and num_candidates >= MANY_CANDIDATES else _blocks
@@ -158,7 +158,7 @@ def bound_neighbors(candidates: Float[Tensor, "P C 2"], radius_m: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Rows that are searched together, and their candidates: positions [r, c], or [1, c] if shared by all rows."""
+    """Rows that are searched together, and the candidates: positions [r, c], or [1, c] if shared by all rows."""
 
     rows: Int64[Tensor, "r"]
     columns: Int64[Tensor, "c"]
@@ -213,7 +213,7 @@ def _select_nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) 
 
 
 def _select_within(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
-    """All candidates within the radius, in the order of their columns."""
+    """All candidates within the radius, in the order of columns."""
     is_inside = squared < radius_m**2
     count = is_inside.sum(-1, keepdim=True)
     column = is_inside.nonzero()[:, 1]  # of all rows, one row after the other

@@ -47,7 +47,7 @@ class SmartPolicy(SmartModel):
         return f"{type(self).__name__}({sum(weight.numel() for weight in self.parameters()):,} weights, {goals})"
 
     def encode(self, scenarios: ScenarioBatch) -> SmartContext:
-        """Map features, history tokens and their decoder features, for goal-free agents."""
+        """Map features, history tokens and decoder features, for goal-free agents."""
         tokens = self._tokenize(scenarios)
         scene = self._build_scene(scenarios)
         history = self._logged_steps(tokens, slice(0, HISTORY_TOKENS))
@@ -92,7 +92,7 @@ class SmartPolicy(SmartModel):
 
         Args:
             context: Result of `encode` for the scenarios.
-            state: State before the decision, whose cache is filled.
+            state: State before the decision; the cache of the state is filled.
         """
         mask = context.agent_mask[:, None].expand(state.heading.shape)
         num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
@@ -115,7 +115,7 @@ class SmartPolicy(SmartModel):
             context: Result of `encode` for the scenarios.
             state: State before the decision, which stays as it is.
             decision: Id of the token that each agent takes, within the agent's class.
-            forced: States [B, N, A, 5] imposed from outside; only agents whose five states are all valid are imposed.
+            forced: States [B, N, A, 5] imposed from outside; only agents with five valid states are imposed.
         """
         poses, decision = apply_decisions(
             decision, state.position, state.heading, context.object_type, self.vocabulary, forced,
@@ -139,7 +139,7 @@ class SmartPolicy(SmartModel):
         return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
     def score(self, context: SmartContext, rollouts: Rollouts) -> CategoricalDistribution:
-        """Distributions [B, N, A, L] along rollouts: one pass of the decoder over all steps.
+        """Distributions [B, N, A, L] along rollouts: a single pass of the decoder over all steps.
 
         Args:
             context: Result of `encode` for the scenarios.
@@ -188,7 +188,7 @@ class SmartPolicy(SmartModel):
 
         Args:
             scenarios: Scenarios that `context` was encoded from, in the same order.
-            context: Context of any policy whose weights have not changed since.
+            context: Context of any policy with weights that have not changed since.
         """
         if not isinstance(context, SmartContext) or not self.sees_as(context.model):
             return self.encode(scenarios)

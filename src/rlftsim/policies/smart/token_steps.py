@@ -82,7 +82,7 @@ def apply_decisions(
         heading: Headings before the decision, radians.
         object_type: Object type of each agent, which decides the box and the token class.
         vocabulary: Vocabulary that the token ids refer to.
-        forced: States [B, N, A, 5] imposed from outside; only agents whose five states are all valid are imposed.
+        forced: States [B, N, A, 5] imposed from outside; only agents with five valid states are imposed.
         catk_compat: Order of operations of the public code, which places boxes and takes poses from the corners.
     """
     class_id = class_of_type(object_type)[:, None].expand(decision.shape)
