@@ -45,8 +45,8 @@ class Segments:
 
         Args:
             position: Positions to look from, map frame, meters.
-            heading: Headings at the positions, so that segments of different direction count as farther away; None = any
-                direction.
+            heading: Headings at the positions, so that segments of different direction count as farther away; None =
+                any direction.
 
         Returns:
             Vector from each position to the nearest point of the segment, and the segment's direction, a unit vector.
