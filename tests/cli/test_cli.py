@@ -533,6 +533,21 @@ def test_a_folder_of_other_rollouts_is_refused(tmp_path, capsys):
     assert "holds rollouts of constant_velocity with another seed: name another --out" in err
 
 
+def test_shares_of_different_settings_do_not_meet_in_a_folder(tmp_path, capsys):
+    words = ["simulate", "constant_velocity", "--data", "synthetic", "--limit", "2", "--num-rollouts", "1"]
+    main([*words, "--out", str(tmp_path), "--share", "1/2"])
+    for path in tmp_path.glob("*.npz"):
+        path.unlink()  # as before the first rollouts are made
+    assert main([*words, "--out", str(tmp_path), "--share", "2/2", "--seed", "1"]) == 2
+    assert "was begun by a share for rollouts of constant_velocity with another seed" in capsys.readouterr().err
+
+
+def test_a_link_to_itself_is_no_output_folder(tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    assert main(["simulate", "constant_velocity", "--data", "synthetic", "--out", str(tmp_path / "loop")]) == 2
+    assert "links lead nowhere: choose another folder" in capsys.readouterr().err
+
+
 def test_settings_without_effect_are_refused(tmp_path, capsys):
     words = ["pretrain", "smart-demo", "--data", "synthetic", "--vocabulary", tmp_path / "v", "--out", tmp_path / "run"]
     status, _, err = run(capsys, *words, "--finetune.reward", "rloo")

@@ -79,6 +79,8 @@ def test_toml_is_read_with_a_mark_in_front(tmp_path):
     ("text", "cause"),
     [
         (b"x = " + b"[" * 3000, "nested more than 64 deep"),
+        (b"a." * 40_000 + b"a = 1", "nested more than 64 deep"),
+        (b"[" + b"'a' . " * 400 + b"a]\nx = 1", "nested more than 64 deep"),
         (b"x = 1\nx = 2", "not TOML: "),
         (b"x = \xff", "not text in UTF-8"),
     ],

@@ -14,8 +14,8 @@ import pytest
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.processes import Processes, SetAside
-from rlftsim.jobs.runner import Inline, Share, Unfinished, check_finished, choose_runner
+from rlftsim.jobs.processes import Processes, SetAside, log_item
+from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work, check_finished, choose_runner
 
 SCRIPT = """
 import rlftsim.jobs.runner
@@ -231,3 +231,13 @@ def test_a_package_that_is_run_as_a_module_needs_no_guard(tmp_path):
     command = [sys.executable, "-m", "doubling"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert (done.stdout, done.returncode) == ("[2, 4, 6]\n", 0), done.stderr
+
+
+def test_lines_about_items_are_added_to_no_file_of_other_content(tmp_path):
+    log, manifest = tmp_path / "items.jsonl", tmp_path / "manifest.json"
+    log_item(log, "a", 1.0, "host")
+    manifest.write_text('{"format": "rlftsim scenarios"}')
+    assert Machines(item_log=log).runner(1, "skip") is not None
+    for settings in (Machines(item_log=manifest), Work(item_log=manifest, on_error="stop")):
+        with pytest.raises(ConfigError, match="no log of items: name another file by --item-log"):
+            settings.runner(2, "stop")

@@ -81,8 +81,9 @@ def simulate_folder(
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
-        _check_identity(out, identity)
+        _check_identity(out, identity, is_alone=lease.is_alone)
         write_identity(out / ABOUT, identity)
+        _check_identity(out, identity, is_alone=lease.is_alone)  # another share may have begun at the same moment
         task = partial(_simulate_scenario, simulation, out)
         paths = run_items("simulate", scenario_ids, task, format=rollouts, lease=lease, runner=runner)
         remove_temporaries_below(out)  # of processes that were killed
@@ -128,11 +129,16 @@ def _simulate_scenario(
     advance(1)
 
 
-def _check_identity(folder: Path, identity: Mapping[str, Any]) -> None:
+def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool = True) -> None:
     """Check that a folder holds no rollouts but those of a description.
 
+    Args:
+        folder: Folder of the rollouts; may be missing.
+        identity: Description of the work, by the names of its settings.
+        is_alone: False where other shares may be at work, whose description stands before their first rollouts do.
+
     Raises:
-        ConfigError: Rollouts of another model or other settings.
+        ConfigError: Rollouts of another model or other settings, or a share that makes such.
         DataError: A damaged description.
     """
     path = folder / ABOUT
@@ -143,7 +149,8 @@ def _check_identity(folder: Path, identity: Mapping[str, Any]) -> None:
     stored = read_json(path, way_out) if path.exists() else identity
     names = [name for name in {**identity, **stored} if name != "model"]
     differences = [name for name in names if stored.get(name) != identity.get(name)]
-    if differences and rollouts:
+    if differences and (rollouts or not is_alone):
+        begun = "holds" if rollouts else "was begun by a share for"
         raise ConfigError(
-            f"{folder} holds rollouts of {stored.get('model')} with another {', '.join(differences)}: {way_out}."
+            f"{folder} {begun} rollouts of {stored.get('model')} with another {', '.join(differences)}: {way_out}."
         )

@@ -5,6 +5,7 @@ The only module that parses either: size, depth, repeated names and numbers are 
 
 import json
 import math
+import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable
@@ -19,6 +20,7 @@ MAX_TOML_BYTES = 1 << 20
 """The same of TOML, which is written by hand and parsed slowly."""
 MAX_DEPTH = 64
 """Brackets that may be nested; deeper ones exhaust the stack of whatever walks through the values."""
+_LONG_DOTTED_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){{{MAX_DEPTH + 1}}}""")
 LONGEST_INTEGER = 40
 """Digits of a whole number: the seeds of numpy have 39."""
 LONGEST_NAME = 40
@@ -122,6 +124,8 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
     """
 
     def parse(decoded: str) -> dict[str, Any]:
+        if _LONG_DOTTED_KEY.search(decoded):  # tomllib takes a time that grows with the square of a key's length
+            raise RecursionError
         try:
             return tomllib.loads(decoded)
         except tomllib.TOMLDecodeError as problem:

@@ -21,7 +21,7 @@ from rlftsim.jobs.documents import parse_json
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the operating system where a file does not fit."""
-_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
+_TEMPORARY = re.compile(r"\..+\..+\.\d+\.tmp")
 """Names that `temporary_path` gives."""
 _ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
 """Where safetensors writes the number of an error of the operating system."""

@@ -108,7 +108,10 @@ def check_name(name: str, meaning: str) -> None:
 
 def _find_holder(folder: Path) -> str | None:
     """The result folder, in words, that a folder is an inner one of."""
-    folder = folder.resolve()
+    try:
+        folder = folder.resolve()
+    except (OSError, RuntimeError):
+        raise DataError(f"{folder}: its links lead nowhere: choose another folder.") from None
     for outer in folder.parents:
         stored_type = recognize_folder(outer)
         if stored_type and folder.relative_to(outer).parts[0] in INNER_FOLDERS.get(stored_type, ()):

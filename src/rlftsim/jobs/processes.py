@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
-from rlftsim.jobs.files import append_text
+from rlftsim.jobs.files import append_text, errors_name
 from rlftsim.jobs.interruption import ctrl_c_blocked
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.threads import keep_freed_memory
@@ -56,6 +56,9 @@ class SetAside(RlftsimError):
         )
 
 
+_LOG_BEGINNING = b'{"item": '
+
+
 def log_item(path: Path | None, name: str, seconds: float, machine: str) -> None:
     """Add a line of JSON about a finished item to a file.
 
@@ -72,6 +75,21 @@ def log_item(path: Path | None, name: str, seconds: float, machine: str) -> None
         done = datetime.now(UTC).isoformat(timespec="seconds")
         values = {"item": name, "seconds": round(seconds, 2), "machine": machine, "done": done}
         append_text(path, json.dumps(values) + "\n")
+
+
+def check_log(path: Path) -> None:
+    """Check that a file to which lines about items are to be added holds such lines, if it is there and not empty.
+
+    Args:
+        path: File of `log_item`; a device or pipe passes.
+
+    Raises:
+        ConfigError: A file of other content, which the lines would damage.
+    """
+    if path.is_file():
+        with errors_name(path), open(path, "rb") as file:
+            if file.read(len(_LOG_BEGINNING)) not in (b"", _LOG_BEGINNING):
+                raise ConfigError(f"{path} is no log of items: name another file by --item-log.")
 
 
 class Attempts:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from rlftsim.errors import ConfigError, NotYetError, RlftsimError
-from rlftsim.jobs.processes import Advance, OnDeath, Processes, Task, log_item
+from rlftsim.jobs.processes import Advance, OnDeath, Processes, Task, check_log, log_item
 
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 """Microseconds of processor time that a container has in a period, and the period; "max" = no limit."""
@@ -176,10 +176,12 @@ class Machines:
             on_death: "skip" sets an item aside that ended `ATTEMPTS` processes, "stop" raises at the first death.
 
         Raises:
-            ConfigError: A text that is no share, both flags, or Ray is not installed.
+            ConfigError: A text that is no share, both flags, a log that is another file, or Ray is not installed.
         """
         if self.share is not None and self.ray is not None:
             raise ConfigError("--share and --ray are two ways to use several machines: choose one.")
+        if self.item_log is not None:
+            check_log(self.item_log)
         if self.ray is not None:
             from rlftsim.jobs.ray import RayRunner
 
@@ -201,7 +203,8 @@ class Work(Machines):
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags, see `Machines`."""
         is_fragile = on_death == "stop" and jobs > 1 and self.share is None and self.ray is None
-        return Processes(jobs, on_death, self.item_log) if is_fragile else super().runner(jobs, on_death)
+        runner = super().runner(jobs, on_death)
+        return Processes(jobs, on_death, self.item_log) if is_fragile else runner
 
 
 def check_begun(runner: Runner, folder: Path) -> None:

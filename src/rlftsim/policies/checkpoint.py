@@ -75,8 +75,9 @@ class StoredModel:
         # JSON has lists where settings have tuples.
         settings = {name: tuple(v) if isinstance(v, list) else v for name, v in self.config.items()}
         try:
-            if is_dataclass(make):
-                _check_names(settings, {field.name for field in fields(make) if field.init})
+            settings_type: Any = make
+            if is_dataclass(settings_type):
+                _check_names(settings, {field.name for field in fields(settings_type) if field.init})
             return make(**settings)
         except (ConfigError, TypeError) as error:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited

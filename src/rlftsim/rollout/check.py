@@ -543,8 +543,8 @@ def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> No
 def freezing_weights_changes_no_score(subject: _Subject) -> str:
     """Freezing the weights changes no score."""
     policies = [subject.copy_module(is_trained) for is_trained in (False, True)]
-    scores = [subject.log_prob(subject.batch, subject.rollouts, policy) for policy in policies]
-    return _check_gap(*scores, SCORE_TOLERANCE)
+    frozen, trained = (subject.log_prob(subject.batch, subject.rollouts, policy) for policy in policies)
+    return _check_gap(frozen, trained, SCORE_TOLERANCE)
 
 
 def shared_passes_change_no_number(subject: _Subject) -> str:

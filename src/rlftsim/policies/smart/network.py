@@ -118,8 +118,10 @@ class Past:
 
     def repeat(self, num_rollouts: int) -> "Past":
         """The past of a single rollout, shared by N rollouts."""
-        values = (self.position, self.heading, self.row)
-        return Past(*(v.expand(-1, num_rollouts, *v.shape[2:]) for v in values), self.sources)
+        position, heading, row = (
+            value.expand(-1, num_rollouts, *value.shape[2:]) for value in (self.position, self.heading, self.row)
+        )
+        return Past(position, heading, row, self.sources)
 
     def without_last_step(self) -> "Past":
         """The past before the last step. Rows of the sources that are no longer referred to stay."""
