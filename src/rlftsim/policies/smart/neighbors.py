@@ -120,7 +120,7 @@ def find_neighbors(
             neighbors = _select_within(squared, radius_m)
         else:
             neighbors = _select_bounded(squared, radius_m, max_neighbors)
-        columns = view.columns[neighbors.index] if len(view.columns) else neighbors.index
+        columns = view.columns[neighbors.index] if cut is _patches and len(view.columns) else neighbors.index
         lists.append((view.rows, columns.masked_fill(~neighbors.mask, 0), neighbors.mask))
     # lists of all views, padded to the longest [R, K]
     width = max([1, *(mask.shape[1] for _, _, mask in lists)])
