@@ -266,7 +266,7 @@ def test_the_goal_logit_bias_prefers_the_speed_that_gets_there_in_time(ahead_m):
     steps_m = torch.linspace(0, 15, 301)
     moves = torch.stack([steps_m, torch.zeros(301)], -1)[None]
     goal, first, vehicle = torch.tensor([[ahead_m, 0.0]]), torch.tensor([16]), torch.tensor([0])
-    best = steps_m[bias(goal, first, vehicle, moves).argmax()]
+    best = steps_m[bias(suitability(goal, first, vehicle, moves), first, vehicle).argmax()]
     assert best == pytest.approx(ahead_m / 16, abs=0.06)
 
 

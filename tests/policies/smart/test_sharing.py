@@ -190,4 +190,4 @@ def test_agents_that_stand_share_a_list_in_all_rollouts_and_decisions(policy, ba
     num_agents = int(batch.agent_mask.sum())
     assert len(view.rows[0]) == 4 * num_agents
     assert sum(len(block.neighbors) for block in view.map_tokens.blocks) <= num_agents
-    assert torch.equal(state.heading, context.heading[:, None].expand_as(state.heading))
+    assert torch.equal(state.heading, context.history.heading[..., -1].expand_as(state.heading))

@@ -1,11 +1,11 @@
-"""Candidates: pairs of an agent that is about to decide and a token that it may well choose.
+"""Candidates: pairs of an agent that is about to decide and a token that the agent may well choose.
 
-A token counts as a candidate if it is more than `exp(-SUPPORT_NATS)` times as likely as the likeliest one. All others
-together have next to no probability, and there are fifty times as many of them. Features fade in over the least likely
-candidates, so that a token just above the limit is as good as one just below it. Agents with a single candidate, such
-as parked cars, have nothing to choose and are left out.
+A token is a candidate if more than `exp(-SUPPORT_NATS)` times as likely as the likeliest token. All further tokens
+together have next to no probability, and are fifty times as many. Features fade in over the least likely candidates, so
+that a token just above the limit is as good as a token just below. Agents with a single candidate, such as parked cars,
+have no choice and are left out.
 
-R agents with a choice, P pairs, O others near an agent. Map frame unless said, meters, radians and seconds.
+R agents with a choice, P pairs, O agents nearby. Map frame unless said, meters, radians and seconds.
 """
 
 from dataclasses import dataclass, field
@@ -16,30 +16,30 @@ from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from rlftsim.geometry import heading_vector, rotate, wrap_angle
-from rlftsim.policies.calibrated.traffic import Pieces, Scene, Traffic
+from rlftsim.policies.calibrated.traffic import Scene, Segments, Traffic
 
 SUPPORT_NATS = 9.2
 """Log of the ratio between the likeliest token and the least likely candidate: 10,000."""
 FADE_NATS = 2.3
-"""Candidates whose features count in part: those this far above the limit."""
+"""Distance above the limit over which the features of candidates fade in."""
 MOVING_MPS = 0.5
-MAX_OTHERS = 6
+MAX_NEIGHBORS = 6
 """Nearest agents that overlaps are looked for with."""
-OTHERS_REACH_M = 40.0
+NEIGHBOR_REACH_M = 40.0
 EDGE_REACH_M = 12.0
 MARGIN_M = 0.5
 """Distance from a box or an edge at which overlap begins to count."""
 CORRIDOR_M = 1.8
 """Largest lateral distance of a leader."""
-LEAST_AHEAD_M = 0.5
-"""Least distance ahead of its center."""
+MIN_LEAD_M = 0.5
+"""Smallest distance of the leader's center ahead."""
 NO_GAP_M = 200.0
 """Gap of an agent without a leader."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Others:
-    """Agents near each of the R agents, in its frame."""
+class _Neighbors:
+    """Agents near each of the R agents, in the frame of that agent."""
 
     position: Float[Tensor, "R O 2"]
     velocity: Float[Tensor, "R O 2"]
@@ -52,11 +52,11 @@ class _Others:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Pairs of agents and tokens, and what can be asked of them. Each answer is computed once, when asked for."""
+    """Pairs of agents and tokens, with values that features read. Each value is computed once, at the first use."""
 
     scene: Scene
     traffic: Traffic
-    place: tuple[Int64[Tensor, "R"], ...]
+    agent_index: tuple[Int64[Tensor, "R"], ...]
     """Indices of the agents along the axes of the traffic: scenario, rollout, agent, moment."""
     row: Int64[Tensor, "P"]
     """Agent of each pair, an index into the R."""
@@ -66,20 +66,20 @@ class Candidates:
     """Log of the token's probability over that of the agent's likeliest token, in the policy that is calibrated."""
     seconds: float
     """Duration of a decision."""
-    _answers: dict[tuple[str, float], Tensor] = field(default_factory=dict)
-    """Overlaps and edges by time, which several features ask for."""
+    _memo: dict[tuple[str, float], Tensor] = field(default_factory=dict)
+    """Overlaps and edges by time, which several features read."""
 
     @property
     def weight(self) -> Float[Tensor, "P"]:
-        """Part in which features of a pair count: 1 but for the least likely candidates."""
+        """Weight in which features of a pair count: 1 but for the least likely candidates."""
         return ((self.log_ratio + SUPPORT_NATS) / FADE_NATS).clamp(max=1.0)
 
     def of_pairs(self, values: Shaped[Tensor, "R *more"]) -> Shaped[Tensor, "P *more"]:
-        """Values of the agents, for each of their pairs."""
+        """Values of the agents, for each pair."""
         return values.index_select(0, self.row)
 
     def where(self, condition: Bool[Tensor, "R"]) -> Float[Tensor, "P"]:
-        """1 for the pairs of agents that a condition holds for, 0 for others."""
+        """1 for the pairs of agents that a condition holds for, else 0."""
         return self.of_pairs(condition.float())
 
     # ---- the agent ------------------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ class Candidates:
     @cached_property
     def is_vehicle(self) -> Bool[Tensor, "R"]:
         """True for vehicles, False for pedestrians and cyclists."""
-        return self.scene.class_id[self.place[0], self.place[2]] == 0
+        return self.scene.class_id[self.agent_index[0], self.agent_index[2]] == 0
 
     @cached_property
     def is_moving(self) -> Bool[Tensor, "R"]:
@@ -97,23 +97,23 @@ class Candidates:
     @cached_property
     def speed(self) -> Float[Tensor, "R"]:
         """Speed of the last decision, m/s."""
-        return self.traffic.speed[self.place]
+        return self.traffic.speed[self.agent_index]
 
     @cached_property
     def time_gap(self) -> Float[Tensor, "R"]:
         """Seconds to the box of the nearest agent ahead within a corridor of 1.8 m to each side; large without any."""
-        ahead, side = self._relative.unbind(-1)  # [R, A]
-        length = self.scene.size[self.place[0], :, 0]  # [R, A]
-        gap = ahead - (self._size[:, :1] + length) / 2
-        leads = (ahead > LEAST_AHEAD_M) & (side.abs() < CORRIDOR_M) & self._is_other
-        return torch.where(leads, gap, NO_GAP_M).amin(-1) / self.speed.clamp(min=1.0)
+        longitudinal, lateral = self._relative.unbind(-1)  # [R, A]
+        length = self.scene.size[self.agent_index[0], :, 0]  # [R, A]
+        gap = longitudinal - (self._size[:, :1] + length) / 2
+        is_leader = (longitudinal > MIN_LEAD_M) & (lateral.abs() < CORRIDOR_M) & self._is_distinct
+        return torch.where(is_leader, gap, NO_GAP_M).amin(-1) / self.speed.clamp(min=1.0)
 
-    @cached_property
+    @property
     def lane_turn(self) -> Float[Tensor, "R"]:
         """Direction of the nearest lane relative to the heading, within ±1 rad; 0 without a lane."""
         return self._lane[1]
 
-    @cached_property
+    @property
     def lane_offset(self) -> Float[Tensor, "R"]:
         """Lateral position of that lane's center, left positive, within ±5 m; 0 without a lane."""
         return self._lane[0]
@@ -128,141 +128,133 @@ class Candidates:
     @cached_property
     def turn_change(self) -> Float[Tensor, "P"]:
         """Turn of the token minus that of the last decision, within ±0.2 rad."""
-        return (self.end[:, 2] - self.of_pairs(self.traffic.turn[self.place])).clamp(-0.2, 0.2)
+        return (self.end[:, 2] - self.of_pairs(self.traffic.turn[self.agent_index])).clamp(-0.2, 0.2)
 
     def overlap(self, seconds: float) -> Float[Tensor, "P"]:
-        """Overlap of the box at a time, the token's motion going on, with boxes of the six nearest agents that keep
-        their velocity: 0 from 0.5 m apart, 1 at contact, 2 from 0.5 m inside.
+        """Overlap of the box at a time, the token's motion going on, with boxes of the six nearest agents at constant
+        velocity: 0 from 0.5 m apart, 1 at contact, 2 from 0.5 m inside.
 
         Args:
-            seconds: Time from now.
+            seconds: Time from now, seconds.
         """
-        if ("overlap", seconds) not in self._answers:
-            self._answers["overlap", seconds] = self._overlap(seconds)
-        return self._answers["overlap", seconds]
+        if (key := ("overlap", seconds)) in self._memo:
+            return self._memo[key]
+        neighbors = self._neighbors
+        position = neighbors.position + neighbors.velocity * seconds  # [R, O, 2]
+        scale = seconds / self.seconds  # of the token's motion, which goes on along the same line
+        # 1. pairs whose token can get near a neighbor, [Q]: first by the longest of the agent's tokens
+        is_reachable = position.norm(dim=-1) < neighbors.reach + self._max_length[:, None] * scale
+        pair, neighbor = self.of_pairs(is_reachable).nonzero(as_tuple=True)
+        row = self.row.index_select(0, pair)
+        neighbor += row * is_reachable.shape[1]  # among the R x O
+        end = self.end.index_select(0, pair) * scale
+        offset = position.flatten(0, 1).index_select(0, neighbor) - end[:, :2]
+        x, y = offset.unbind(-1)
+        touches = x.square() + y.square() < neighbors.reach.flatten().index_select(0, neighbor).square()
+        pair, neighbor, row, offset, end = (values[touches] for values in (pair, neighbor, row, offset, end))
+        # 2. separation along and across the token's heading, of the boxes that enclose the neighbors there
+        heading = end[:, 2]
+        longitudinal, lateral = rotate(offset, -heading).abs().unbind(-1)
+        cos, sin = heading_vector(neighbors.turn.flatten().index_select(0, neighbor) - heading).abs().unbind(-1)
+        length, width = neighbors.half_size.flatten(0, 1).index_select(0, neighbor).unbind(-1)
+        agent_length, agent_width = self._size.index_select(0, row).unbind(-1)
+        longitudinal = longitudinal - agent_length / 2 - cos * length - sin * width
+        lateral = lateral - agent_width / 2 - sin * length - cos * width
+        depth = (1 - torch.maximum(longitudinal, lateral) / MARGIN_M).clamp(0.0, 2.0)
+        self._memo[key] = torch.zeros_like(self.log_ratio).detach().scatter_reduce(0, pair, depth, "amax")
+        return self._memo[key]
 
     def road_edge(self, seconds: float) -> Float[Tensor, "P"]:
         """Nearness of the box to the road edge at a time, the token's motion going on: 0 from 0.5 m inside the road, 1
         where a side touches the edge, 3 from 1 m beyond; 0 farther than 12 m from any edge.
 
         Args:
-            seconds: Time from now.
+            seconds: Time from now, seconds.
         """
-        if ("edge", seconds) not in self._answers:
-            self._answers["edge", seconds] = self._road_edge(seconds)
-        return self._answers["edge", seconds]
+        if (key := ("edge", seconds)) not in self._memo:
+            inside, approach = self._edge_motion
+            inside = self.of_pairs(inside) - approach * (seconds / self.seconds)
+            self._memo[key] = (1 - inside / MARGIN_M).clamp(0.0, 3.0)
+        return self._memo[key]
 
-    # ---- parts ----------------------------------------------------------------------------------------------------
-
-    def _overlap(self, seconds: float) -> Float[Tensor, "P"]:
-        others = self._others
-        position = others.position + others.velocity * seconds  # [R, O, 2]
-        scale = seconds / self.seconds  # of the token's way, which goes on along the same line
-        # 1. pairs whose token can get near one of the others, [Q]: first by the longest of the agent's tokens
-        is_near = position.norm(dim=-1) < others.reach + self._longest[:, None] * scale
-        pair, other = self.of_pairs(is_near).nonzero(as_tuple=True)
-        row = self.row.index_select(0, pair)
-        other += row * is_near.shape[1]  # among the R x O
-        end = self.end.index_select(0, pair) * scale
-        offset = position.flatten(0, 1).index_select(0, other) - end[:, :2]
-        x, y = offset.unbind(-1)
-        touches = x.square() + y.square() < others.reach.flatten().index_select(0, other).square()
-        pair, other, row, offset, end = (values[touches] for values in (pair, other, row, offset, end))
-        # 2. separation along and across the token's heading, of the boxes that enclose the others there
-        heading = end[:, 2]
-        along, across = rotate(offset, -heading).abs().unbind(-1)
-        cos, sin = heading_vector(others.turn.flatten().index_select(0, other) - heading).abs().unbind(-1)
-        length, width = others.half_size.flatten(0, 1).index_select(0, other).unbind(-1)
-        own_length, own_width = self._size.index_select(0, row).unbind(-1)
-        along = along - own_length / 2 - cos * length - sin * width
-        across = across - own_width / 2 - sin * length - cos * width
-        depth = (1 - torch.maximum(along, across) / MARGIN_M).clamp(0.0, 2.0)
-        return torch.zeros_like(self.log_ratio).detach().scatter_reduce(0, pair, depth, "amax")
-
-    def _road_edge(self, seconds: float) -> Float[Tensor, "P"]:
-        inside, way = self._edge_motion
-        inside = self.of_pairs(inside) - way * (seconds / self.seconds)
-        return (1 - inside / MARGIN_M).clamp(0.0, 3.0)
+    # ---- geometry -------------------------------------------------------------------------------------------------
 
     @cached_property
     def _edge_motion(self) -> tuple[Float[Tensor, "R"], Float[Tensor, "P"]]:
-        """Distance of the agent's side to the nearest road edge, positive inside the road, and what a token takes off
-        it."""
-        to_edge, _, sign = self._edge
+        """Distance between the agent's side and the nearest road edge, positive inside the road, and the distance that
+        a token subtracts."""
+        to_edge, _, sign = self._find_nearest(self.scene.edges, torch.ones_like(self.is_moving), by_heading=False)
         distance = to_edge.norm(dim=-1)
         inside = sign * distance - self._size[:, 1] / 2
         toward = self.of_pairs(rotate(to_edge * (sign / distance.clamp(min=1e-3))[:, None], -self._heading))  # [P, 2]
-        way = self.end[:, 0] * toward[:, 0] + self.end[:, 1] * toward[:, 1]
-        return torch.where(distance < EDGE_REACH_M, inside, torch.inf), way
+        approach = self.end[:, 0] * toward[:, 0] + self.end[:, 1] * toward[:, 1]
+        return torch.where(distance < EDGE_REACH_M, inside, torch.inf), approach
 
     @cached_property
     def _heading(self) -> Float[Tensor, "R"]:
-        return self.traffic.heading[self.place]
+        return self.traffic.heading[self.agent_index]
 
     @cached_property
     def _size(self) -> Float[Tensor, "R 2"]:
-        return self.scene.size[self.place[0], self.place[2]]
+        return self.scene.size[self.agent_index[0], self.agent_index[2]]
 
     @cached_property
     def _relative(self) -> Float[Tensor, "R A 2"]:
         """Positions of all agents of the scene in the agent's frame."""
-        b, n, _, moment = self.place
-        offset = self.traffic.position[b, n, :, moment] - self.traffic.position[self.place][:, None]
+        b, n, _, moment = self.agent_index
+        offset = self.traffic.position[b, n, :, moment] - self.traffic.position[self.agent_index][:, None]
         return rotate(offset, -self._heading[:, None])
 
     @cached_property
-    def _is_other(self) -> Bool[Tensor, "R A"]:
-        b, _, a, _ = self.place
-        present = self.scene.agent_mask[b]
-        return present & (torch.arange(present.shape[1], device=a.device) != a[:, None])
+    def _is_distinct(self) -> Bool[Tensor, "R A"]:
+        """True for the agents of the scene that are present and not the agent itself."""
+        b, _, a, _ = self.agent_index
+        is_present = self.scene.agent_mask[b]
+        return is_present & (torch.arange(is_present.shape[1], device=a.device) != a[:, None])
 
     @cached_property
-    def _longest(self) -> Float[Tensor, "R"]:
-        """Longest way of a candidate token."""
+    def _max_length(self) -> Float[Tensor, "R"]:
+        """Length of the longest candidate token."""
         return torch.zeros_like(self._heading).scatter_reduce(0, self.row, self.end[:, :2].norm(dim=-1), "amax")
 
     @cached_property
-    def _others(self) -> "_Others":
+    def _neighbors(self) -> "_Neighbors":
         """The nearest agents, in the agent's frame."""
-        b, n, _, moment = self.place
-        distance = self._relative.square().sum(-1).masked_fill(~self._is_other, torch.inf)
-        near, index = distance.topk(min(MAX_OTHERS, distance.shape[1]), largest=False)  # [R, O]
-        agent = (b[:, None], n[:, None], index, moment[:, None])
-        half_size = self.scene.size[agent[0], index] / 2
+        b, n, _, moment = self.agent_index
+        squared = self._relative.square().sum(-1).masked_fill(~self._is_distinct, torch.inf)
+        squared, index = squared.topk(min(MAX_NEIGHBORS, squared.shape[1]), largest=False)  # [R, O]
+        neighbor = (b[:, None], n[:, None], index, moment[:, None])
+        half_size = self.scene.size[b[:, None], index] / 2
         reach = half_size.norm(dim=-1) + (self._size.norm(dim=-1) / 2 + MARGIN_M)[:, None]
-        return _Others(
+        return _Neighbors(
             position=self._relative.gather(1, index[..., None].expand(-1, -1, 2)),
-            velocity=rotate(self.traffic.velocity[agent], -self._heading[:, None]),
-            turn=self.traffic.heading[agent] - self._heading[:, None],
+            velocity=rotate(self.traffic.velocity[neighbor], -self._heading[:, None]),
+            turn=self.traffic.heading[neighbor] - self._heading[:, None],
             half_size=half_size,
-            reach=torch.where(near < OTHERS_REACH_M**2, reach, -torch.inf),
+            reach=torch.where(squared < NEIGHBOR_REACH_M**2, reach, -torch.inf),
         )
 
     @cached_property
     def _lane(self) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Lateral offset and turn of the nearest lane of moving vehicles."""
-        to_lane, direction, _ = self._nearest(self.scene.lanes, self.is_moving, by_heading=True)
+        to_lane, direction, _ = self._find_nearest(self.scene.lanes, self.is_moving, by_heading=True)
         offset = rotate(to_lane, -self._heading)[:, 1].clamp(-5.0, 5.0)
         turn = wrap_angle(torch.atan2(direction[:, 1], direction[:, 0]) - self._heading).clamp(-1.0, 1.0)
         has_lane = direction.any(-1)
         return torch.where(has_lane, offset, 0.0), torch.where(has_lane, turn, 0.0)
 
-    @cached_property
-    def _edge(self) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"], Float[Tensor, "R"]]:
-        """Vector to the nearest road edge, its direction, and 1 on the road, -1 off it."""
-        return self._nearest(self.scene.edges, torch.ones_like(self.is_moving), by_heading=False)
-
-    def _nearest(
-        self, pieces: tuple[Pieces | None, ...], asked: Bool[Tensor, "R"], *, by_heading: bool
+    def _find_nearest(
+        self, segments: tuple[Segments | None, ...], is_selected: Bool[Tensor, "R"], *, by_heading: bool
     ) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"], Float[Tensor, "R"]]:
-        """Vector to the nearest piece, its direction, and 1 left of it, -1 right of it; far away where not asked."""
-        position, heading = self.traffic.position[self.place], self._heading
-        to_piece, direction = torch.full_like(position, 1e3), torch.zeros_like(position)
-        for scenario, some in enumerate(pieces):
-            rows = (asked & (self.place[0] == scenario)).nonzero()[:, 0]
-            if some is not None and len(rows):
-                vectors = some.nearest(position[rows], heading[rows] if by_heading else None)
-                to_piece[rows], direction[rows] = vectors
-        # left of a piece: the way to it turns right
-        side = direction[:, 1] * to_piece[:, 0] - direction[:, 0] * to_piece[:, 1]
-        return to_piece, direction, torch.where(side > 0, 1.0, -1.0)
+        """Vector to the nearest segment, the segment's direction, and 1 left of the segment, -1 right; a vector of 1 km
+        per axis for agents that are not selected."""
+        position, heading = self.traffic.position[self.agent_index], self._heading
+        offset, direction = torch.full_like(position, 1e3), torch.zeros_like(position)
+        for scenario, scenario_segments in enumerate(segments):
+            rows = (is_selected & (self.agent_index[0] == scenario)).nonzero()[:, 0]
+            if scenario_segments is not None and len(rows):
+                headings = heading[rows] if by_heading else None
+                offset[rows], direction[rows] = scenario_segments.find_nearest(position[rows], headings)
+        # left of a segment, the vector to the segment points to the right
+        side = direction[:, 1] * offset[:, 0] - direction[:, 0] * offset[:, 1]
+        return offset, direction, torch.where(side > 0, 1.0, -1.0)

@@ -1,4 +1,4 @@
-"""Token distributions with a weighted sum of features on their logits.
+"""Token distributions with a weighted sum of features on the logits.
 
 R elements, P pairs of an element and a candidate token, K features, V tokens.
 """
@@ -21,7 +21,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 
 @dataclass(frozen=True, eq=False)
 class TiltedDistribution(CategoricalDistribution):
-    """p(token) proportional to base(token) exp(eta · f(state, token)); the base itself, bit for bit, where eta is 0.
+    """p(token) proportional to base(token) exp(eta · f(state, token)); the base, bit for bit, where eta is 0.
 
     Features are 0 for tokens that are no candidates, see `Candidates`.
     """
@@ -42,7 +42,7 @@ class TiltedDistribution(CategoricalDistribution):
 
     @cached_property
     def logits(self) -> Float[Tensor, "R V"]:
-        """float32."""
+        """Logits in float32: those of the base, shifted for candidates."""
         logits = self.base.logits
         if not self.eta.any():
             return logits
@@ -55,14 +55,14 @@ class TiltedDistribution(CategoricalDistribution):
         return torch.stack([feature(candidates) for feature in self.features], -1) * candidates.weight[:, None]
 
     def score_function(self, decision: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
-        """Gradient of the decisions' log-probability by eta: the features of what was chosen minus their mean.
+        """Gradient of the decisions' log-probability by eta: the features of the chosen token minus the mean of all.
 
         Args:
-            decision: Token ids.
+            decision: Id of the token that each element chose, drawn from the full distribution.
         """
-        row, token, place = self._pairs
-        chosen = token == self._rows(decision).index_select(0, row)
-        weight = chosen.float() - self.log_probs.detach().flatten().index_select(0, place).exp()
+        row, token, logit_index = self._pairs
+        is_chosen = token == self._rows(decision).index_select(0, row)
+        weight = is_chosen.float() - self.log_probs.detach().flatten().index_select(0, logit_index).exp()
         centered = self.values.new_zeros(self._num_rows, len(self.features))
         return self._dense(centered.index_add(0, row, weight[:, None] * self.values.detach()))
 
@@ -76,22 +76,23 @@ class TiltedDistribution(CategoricalDistribution):
 
     @cached_property
     def _pairs(self) -> tuple[Int64[Tensor, "P"], Int64[Tensor, "P"], Int64[Tensor, "P"]]:
-        """Row and token of each candidate, and its place in the flattened logits; rows with a single one have none."""
+        """Row and token of each candidate, and the index into the flattened logits; rows with a single candidate have
+        none."""
         num_tokens = self.base.logits.shape[1]
-        place = (self.base.logits > self._peak - SUPPORT_NATS).flatten().nonzero()[:, 0]
-        row = place.div(num_tokens, rounding_mode="floor")
+        logit_index = (self.base.logits > self._peak - SUPPORT_NATS).flatten().nonzero()[:, 0]
+        row = logit_index.div(num_tokens, rounding_mode="floor")
         has_choice = (torch.bincount(row, minlength=self._num_rows) > 1).index_select(0, row)
-        row, place = row[has_choice], place[has_choice]
-        return row, place - row * num_tokens, place
+        row, logit_index = row[has_choice], logit_index[has_choice]
+        return row, logit_index - row * num_tokens, logit_index
 
     @cached_property
     def _candidates(self) -> Candidates:
-        row, token, place = self._pairs
+        row, token, logit_index = self._pairs
         has_choice, index = row.unique_consecutive(return_inverse=True)
         agent = tuple(axis[has_choice] for axis in find_rows(self.mask, is_dense=self._num_rows == self.mask.numel()))
         agent = (*agent, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
         class_id = self.scene.class_id[agent[0], agent[2]].index_select(0, index)
         ends = self.vocabulary.poses[:, :, -1]  # [C, V, 3]
         end = ends.flatten(0, 1).index_select(0, class_id * ends.shape[1] + token)
-        log_ratio = self.base.logits.flatten().index_select(0, place) - self._peak[:, 0].index_select(0, row)
+        log_ratio = self.base.logits.flatten().index_select(0, logit_index) - self._peak[:, 0].index_select(0, row)
         return Candidates(self.scene, self.traffic, agent, index, end, log_ratio, self.seconds)

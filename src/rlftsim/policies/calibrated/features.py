@@ -1,12 +1,12 @@
-"""Features of a state and a token, by name. A calibrated policy adds a weighted sum of some of them to its logits.
+"""Features of a state and a token, by name. A calibrated policy adds a weighted sum of selected features to the logits.
 
     @register_feature("braking", low=-1.5, high=0.0)
     def braking(candidates: Candidates) -> Float[Tensor, "P"]:
         return candidates.speed_change * candidates.where(candidates.is_vehicle)
 
-A feature is one function on tensors, of all pairs of agents and tokens at once, and has bounds, to which its values
-are clipped: without them rare tokens with an extreme value would win. It knows what is known before the decision, so
-it may not read the logged future. A package of its own announces its features as entry points:
+A feature is a function on tensors, of all pairs of agents and tokens at once, and has bounds, to which values are
+clipped: without bounds rare tokens with an extreme value would win. A feature is computed before the decision, and
+may not read the logged future. A separate package announces features as entry points:
 
     [project.entry-points."rlftsim.features"]
     braking = "my_package.features:braking"
@@ -61,9 +61,9 @@ def register_feature(
     """Decorator that registers a function of `Candidates` as a feature.
 
     Args:
-        name: Name in recipes, model folders and tables; one of your own is replaced with a warning.
-        low: Least value; lower ones are clipped to it.
-        high: Greatest value.
+        name: Name in recipes, model folders and tables; an earlier feature of yours is replaced with a warning.
+        low: Least value; lower values are clipped to this bound.
+        high: Greatest value; higher values are clipped to this bound.
 
     Raises:
         ConfigError: The name is that of a shipped feature, or the bounds are in the wrong order.
@@ -83,7 +83,7 @@ def features_by_name(names: Sequence[str]) -> tuple[Feature, ...]:
     """The features of some names.
 
     Raises:
-        ConfigError: None at all, one twice, an unknown one, or something else under that name.
+        ConfigError: No name at all, a repeated or an unknown name, or a name under which there is no feature.
     """
     if not names or len(set(names)) < len(names):
         raise ConfigError(f"features are different names, at least one, got {', '.join(names) or 'none'}.")
@@ -119,7 +119,7 @@ def turn_to_lane_direction(c: Candidates) -> Float[Tensor, "P"]:
 
 @register_feature("turn_to_lane_center", low=-2.0, high=2.0)
 def turn_to_lane_center(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of turn times the lateral offset of the lane's center; positive = towards it."""
+    """Change of turn times the lateral offset of the lane's center; positive = towards the center."""
     return 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)
 
 

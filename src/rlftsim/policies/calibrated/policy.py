@@ -1,4 +1,4 @@
-"""A policy with a vocabulary, calibrated: eta · f(state, token) on its logits, with features f that have names.
+"""A policy with a vocabulary, calibrated: eta · f(state, token) on the logits, with named features f.
 
 B scenarios, N rollouts, A agents, L decisions, K features.
 """
@@ -36,12 +36,12 @@ PASSED_ON = (
     *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced"),
     *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary"),
 )
-"""Attributes that a calibrated policy has if its base has them, and that are those of the base."""
+"""Attributes that a calibrated policy passes on from the base, if the base has these."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedContext:
-    """Context of the base, and what features look at."""
+    """Context of the base, and the scene that features look at."""
 
     base: Any
     scene: Scene
@@ -56,26 +56,26 @@ class CalibratedState:
 
     @property
     def poses(self) -> Tensor | None:
-        """Of the base."""
+        """Poses of the last decision in the state of the base."""
         return self.base.poses
 
     @property
     def draws(self) -> Tensor | None:
-        """Of the base."""
+        """Draws in the state of the base."""
         return self.base.draws
 
 
 class CalibratedPolicy(nn.Module):
-    """A `TokenPolicy` whose token logits get eta · f(state, token) more.
+    """A `TokenPolicy` with eta · f(state, token) added to the token logits.
 
     Log-probabilities, KL and entropy are those of the tilted distribution. Further training changes the weights of the
-    base below a fixed eta; what imitates the log without a rollout (`teacher_forced`) sees the base alone.
+    base below a fixed eta; imitation of the log without a rollout (`teacher_forced`) sees the base alone.
 
     Args:
-        base: Policy with a vocabulary and weights.
-        features: Names of registered features.
-        eta: Their weights; None = zeros, with which it decides as its base, bit for bit.
-        calibration: How eta was fitted, to be stored with it; see `training.calibrate`.
+        base: Policy with a vocabulary and weights, which is calibrated.
+        features: Names of registered features, each at most once.
+        eta: Weights of the features; None = zeros, with which the decisions are those of the base, bit for bit.
+        calibration: Account of how eta was fitted, stored with the weights; see `training.calibrate`.
     """
 
     architecture = "calibrated"
@@ -99,7 +99,7 @@ class CalibratedPolicy(nn.Module):
             raise ConfigError(
                 f"eta has {len(values)} weights for {len(self.features)} features: it needs one for each."
             )
-        # A parameter, so that runs can be averaged; never trained by a gradient of the whole model.
+        # A parameter, so that runs can be averaged; never trained by a gradient of the complete model.
         self.eta = nn.Parameter(values, requires_grad=False)
         self._calibration = dict(calibration or {})
         self.train(base.training)
@@ -116,11 +116,11 @@ class CalibratedPolicy(nn.Module):
         return self._calibration
 
     def set_calibration(self, eta: Tensor, calibration: Mapping[str, Any]) -> None:
-        """Take fitted weights and how they were fitted.
+        """Set fitted weights, and the account of the fit.
 
         Args:
-            eta: [K], in the order of the features.
-            calibration: Values that JSON has.
+            eta: Weights [K], in the order of the features.
+            calibration: Account of the fit, of values that JSON has, for calibration.json and the card.
         """
         with torch.no_grad():
             self.eta.copy_(eta)
@@ -143,10 +143,10 @@ class CalibratedPolicy(nn.Module):
         """The current step, N times.
 
         Args:
-            context: Of `encode`.
-            num_rollouts: N of each scenario.
-            goals: For the base.
-            noise: For the base.
+            context: Result of `encode` for the scenarios.
+            num_rollouts: Number N of futures that each scenario gets.
+            goals: Goals [B, N, A] of all agents, for the base; None = goal-free.
+            noise: Uniform numbers for the base, `initial_noise_size` per agent.
         """
         base = self.base.begin(context.base, num_rollouts, goals, noise)
         return CalibratedState(base, context.scene.begin(num_rollouts))
@@ -155,8 +155,8 @@ class CalibratedPolicy(nn.Module):
         """Tilted distributions [B, N, A] of the next token.
 
         Args:
-            context: Of `encode`.
-            state: Before the decision.
+            context: Result of `encode` for the scenarios.
+            state: State before the decision.
         """
         return self._tilt(context, self.base.decide(context.base, state.base), state.traffic)
 
@@ -166,20 +166,20 @@ class CalibratedPolicy(nn.Module):
         """State after a decision.
 
         Args:
-            context: Of `encode`.
-            state: Before the decision.
-            decision: Token ids [B, N, A].
-            forced: States imposed from outside.
+            context: Result of `encode` for the scenarios.
+            state: State before the decision, which stays as it is.
+            decision: Token ids [B, N, A] that the agents take.
+            forced: States [B, N, A, t] imposed from outside, as for the base.
         """
         base = self.base.advance(context.base, state.base, decision, forced)
-        return CalibratedState(base, state.traffic.after(base.poses, self._seconds))
+        return CalibratedState(base, state.traffic.advance(base.poses, self._seconds))
 
     def score(self, context: CalibratedContext, rollouts: Rollouts) -> CategoricalDistribution:
         """Tilted distributions [B, N, A, L] along rollouts.
 
         Args:
-            context: Of `encode`.
-            rollouts: Of the same scenarios.
+            context: Result of `encode` for the scenarios.
+            rollouts: Rollouts of the same scenarios, by this policy or another.
         """
         scored: Any = self.base.score(context.base, rollouts)
         if not self.eta.any():
@@ -187,7 +187,7 @@ class CalibratedPolicy(nn.Module):
         moments = [context.scene.begin(rollouts.num_rollouts)]
         path = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)  # [B, N, A, T, 3]
         for poses in path.split(self.steps_per_decision, 3)[:-1]:
-            moments.append(moments[-1].after(poses, self._seconds))
+            moments.append(moments[-1].advance(poses, self._seconds))
         return self._tilt(context, scored, join_moments(moments))
 
     # ---- variants of the base -------------------------------------------------------------------------------------
@@ -196,11 +196,11 @@ class CalibratedPolicy(nn.Module):
         """Calibrated copy whose base is goal-conditioned, see `ConditionablePolicy`.
 
         Args:
-            encoding: Name of an encoding of goals of the base.
-            logit_bias: Add a goal-progress bias to the logits of the base; None = its default.
+            encoding: Name of an encoding of goals that the base has.
+            logit_bias: Whether a goal-progress bias is added to the logits of the base; None = default of the base.
 
         Raises:
-            ConfigError: The base cannot be conditioned, or not so.
+            ConfigError: The base cannot be conditioned, or not with this encoding.
         """
         if not hasattr(self.base, "with_goal_conditioning"):
             raise ConfigError(f"a {type(self.base).__name__} cannot be goal-conditioned: leave --goal out.")
@@ -210,10 +210,10 @@ class CalibratedPolicy(nn.Module):
         """Calibrated copy whose base follows goals more closely, see `GoalConditionedPolicy`.
 
         Args:
-            scale: Factor of what pulls towards goals.
+            scale: Factor of the goal logit bias of the base, 0 or more; above 1 = more closely than learned.
 
         Raises:
-            ConfigError: The base has nothing that could be scaled.
+            ConfigError: The base has no bias that could be scaled.
         """
         if not hasattr(self.base, "with_guidance"):
             raise ConfigError(f"guidance_scale={scale:g} has no effect on a {type(self.base).__name__}: leave it out.")
@@ -225,15 +225,14 @@ class CalibratedPolicy(nn.Module):
     # ---- files ----------------------------------------------------------------------------------------------------
 
     def save_pretrained(self, folder: str | os.PathLike, *, card: str = "") -> None:
-        """Write config.json, eta, calibration.json, README.md and the base's own model folder, `base`.
+        """Write config.json, eta, calibration.json, README.md and the model folder of the base, `base`.
 
         Args:
-            folder: Created where it is missing.
-            card: Text of README.md.
+            folder: Folder of the model, created where it is missing.
+            card: Text of README.md, in Markdown; the table of the calibration follows.
         """
-        self.base.save_pretrained(
-            Path(folder) / BASE, card=f"Base of the calibrated model in the folder above.\n\n{card}"
-        )
+        base_card = f"Base of the calibrated model in the folder above.\n\n{card}"
+        self.base.save_pretrained(Path(folder) / BASE, card=base_card)
         if self._calibration:
             write_text(Path(folder) / CALIBRATION, json.dumps(self._calibration, indent=1) + "\n")
             card = f"{card}\n{calibration_table(self._calibration)}"
@@ -241,7 +240,7 @@ class CalibratedPolicy(nn.Module):
 
     @classmethod
     def from_pretrained(cls, folder: str | os.PathLike) -> "CalibratedPolicy":
-        """Policy of a model folder as `save_pretrained` writes it.
+        """Policy of a model folder as written by `save_pretrained`.
 
         Raises:
             ConfigError: There is no such folder, or a feature is not registered here.
@@ -256,7 +255,7 @@ class CalibratedPolicy(nn.Module):
         calibration = read_calibration(path) if path.exists() else {}
         return stored.build(lambda features: cls(base, features, eta.tolist(), calibration))
 
-    # ---- parts ----------------------------------------------------------------------------------------------------
+    # ---- the tilt -------------------------------------------------------------------------------------------------
 
     @property
     def _seconds(self) -> float:

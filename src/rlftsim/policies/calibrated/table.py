@@ -1,4 +1,4 @@
-"""A calibration as a table: what each feature weighs and earns, and what changed on the scenarios held back."""
+"""A calibration as a table: weight and gain of each feature, and the changes on the scenarios held back."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,31 +38,30 @@ def calibration_table(calibration: Mapping[str, Any]) -> str:
     """Markdown of a calibration.
 
     Args:
-        calibration: Values of calibration.json.
+        calibration: Values of calibration.json, as `training.calibrate` writes these.
     """
-    fitted, held = calibration["num_scenarios"]
+    num_fitted, num_held_back = calibration["num_scenarios"]
     scores = ("rmm", "kinematic", "interactive", "map_based")
-    features = sorted(calibration["features"], key=lambda row: -row["rmm"])
-    earned = [
+    features = [
         [row["feature"], f"{row['eta']:+.3f}", f"{row['t']:+.1f}", *(f"{row[name]:+.4f}" for name in scores)]
-        for row in features
+        for row in sorted(calibration["features"], key=lambda row: -row["rmm"])
     ]
-    tried = [
+    lengths = [
         [f"{row['length']:g}", f"{row['kl']:.4f}", *(_with_t(row[name], style) for name, (_, style) in CHANGES.items())]
         for row in calibration["held_back"]
     ]
     return f"""## Calibration
 
-What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {fitted} scenarios with
+What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {num_fitted} scenarios with
 {calibration["num_rollouts"]} rollouts each; t is that of its gradient over scenarios.
 Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "nothing"}.
 
-{_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), earned)}
+{_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), features)}
 
-Measured on {held} scenarios that were held back, with t in parentheses. The length taken is
+Measured on {num_held_back} scenarios that were held back, with t in parentheses. The length taken is
 {calibration["length"]:.2f}.
 
-{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), tried)}
+{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), lengths)}
 """
 
 

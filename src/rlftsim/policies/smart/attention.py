@@ -46,12 +46,7 @@ class NeighborBlock:
     """Normalized embedding of each row's relation to each neighbor, followed by the neighbor's normalized features
     if W = 2 D. Arbitrary finite numbers for padding."""
     num_sharing: int = 1
-    """m: so many rows share each list and attend as one row with m H heads."""
-
-    @property
-    def num_rows(self) -> int:
-        """Rows that attend, r m."""
-        return len(self.neighbors) * self.num_sharing
+    """m: so many rows share each list and attend as a single row with m H heads. The block has r m rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +66,9 @@ class Neighborhoods:
     """True = the row has a neighbor, where all rows are there."""
 
     @property
-    def dtype(self) -> torch.dtype:
-        """Type of the edge features."""
-        return self.blocks[0].edge_features.dtype
-
-    @property
     def sizes(self) -> list[int]:
         """Rows of each block."""
-        return [block.num_rows for block in self.blocks]
+        return [len(block.neighbors) * block.num_sharing for block in self.blocks]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +111,9 @@ def build_neighborhoods(
     pairs = FLOATS_PER_BLOCK.get(mask.device.type, FLOATS_PER_BLOCK_ELSEWHERE) // dim
     if padded:
         size = min(max(pairs // mask.shape[1], 1), MOST_ROWS_PER_BLOCK)
-        rows, has_neighbor = None, mask.any(-1)
-        cuts = [(slice(start, start + size), slice(None), 1) for start in range(0, len(mask), size)]
+        rows, cuts = None, [(slice(start, start + size), slice(None), 1) for start in range(0, len(mask), size)]
     else:
         rows, cuts = _sort(mask, pairs, groups)
-        has_neighbor = None
     blocks = []
     for lists, columns, num_sharing in cuts:
         index = neighbors[lists, columns]  # [r, K]
@@ -133,7 +121,8 @@ def build_neighborhoods(
         bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~mask[lists, columns], IMPOSSIBLE)
         blocks.append(NeighborBlock(index, bias[:, None], edge_features, num_sharing))
     is_trained = any(block.edge_features.requires_grad for block in blocks)
-    return Neighborhoods(rows, tuple(blocks), EdgeGradients.from_blocks(blocks) if is_trained else None, has_neighbor)
+    gradients = EdgeGradients.from_blocks(blocks) if is_trained else None
+    return Neighborhoods(rows, tuple(blocks), gradients, mask.any(-1) if padded else None)
 
 
 def _sort(
@@ -175,24 +164,15 @@ def _embed_edges(
     Where a gradient flows, relations are embedded again in the backward pass instead of stored.
     """
     is_constant = embedding.is_frozen and (features is None or not features.requires_grad)
-    if is_constant or not torch.is_grad_enabled():
-        return _embed_constant_edges(embedding, values, neighbors, features)
+    if not is_constant and torch.is_grad_enabled():
 
-    def embed() -> Float[Tensor, "r K D"]:
-        return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
+        def embed() -> Float[Tensor, "r K D"]:
+            return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
 
-    # the embedding draws no random numbers, so their state need not be restored
-    relation = checkpoint(embed, use_reentrant=False, preserve_rng_state=False)
-    return relation if features is None else torch.cat([relation, functional.embedding(neighbors, features)], -1)
-
-
-def _embed_constant_edges(
-    embedding: RelationEmbedding,
-    values: Float[Tensor, "r K n"],
-    neighbors: Int64[Tensor, "r K"],
-    features: Float[Tensor, "S D"] | None,
-) -> Float[Tensor, "r K W"]:
-    """Edge features of a block, without gradient and copies."""
+        # the embedding draws no random numbers, so their state need not be restored
+        relation = checkpoint(embed, use_reentrant=False, preserve_rng_state=False)
+        return relation if features is None else torch.cat([relation, functional.embedding(neighbors, features)], -1)
+    # the same without gradient and copies
     last: nn.Linear = embedding.out[-1]  # type: ignore[assignment]
     hidden = embedding.out[:-1](embedding.embed_inputs(values.flatten(0, 1))).to(last.weight.dtype)  # [rK, D]
     dim = last.out_features
@@ -274,7 +254,8 @@ def gather_edges(
         token = None if neighborhoods.gradients is None else neighborhoods.gradients.token
         # autocast would copy the edge features in each layer: here reading them costs more than computing with them
         with torch.autocast(queries[0].device.type, enabled=False):
-            tensors = (None if t is None else t.to(neighborhoods.dtype) for t in (source, *queries))
+            dtype = neighborhoods.blocks[0].edge_features.dtype
+            tensors = (None if t is None else t.to(dtype) for t in (source, *queries))
             *sums, total = _GatherEdges.apply(neighborhoods, dropout, token, *tensors)  # type: ignore
         return tuple(sums), total
     # the fused kernel is faster, although relations and sources are copied together for it

@@ -51,7 +51,7 @@ _HEAD_BIAS = PREFIX + "agent_encoder.token_predict_head.mlp.3.bias"
 
 @dataclass(frozen=True, eq=False)
 class CatkImport:
-    """An imported model, its size and its origin."""
+    """An imported model, with size and origin."""
 
     policy: SmartPolicy
     size: str
@@ -94,7 +94,7 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
 
 def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
-    """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits.
+    """Copies of a model's weights under the public code's names, on the CPU; a second import gives the same bits.
 
     Raises:
         CheckpointError: The model is goal-conditioned, or has a head that the public code lacks.
@@ -129,17 +129,15 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by the public code's names, and the file's settings of the decoder and the tokens, empty without any."""
     if path.suffix == ".safetensors":
         try:
-            weights, _ = read_tensors(path, "get the file again", error=CheckpointError)
-            settings = {}
+            weights, settings = read_tensors(path, "get the file again", error=CheckpointError)[0], {}
         except FileNotFoundError:
             raise CheckpointError(f"{path}: no such file.") from None
     else:
-        file = read_lightning(path)
-        weights, settings = file.weights, find_group(file.settings, "model_config")
+        weights, settings = read_lightning(path)
     weights = dict(strip_wrappers(weights, ()))
     if not any(key.startswith(PREFIX) for key in weights):
         weights = {PREFIX + key: value for key, value in weights.items()}
-    return weights, settings
+    return weights, find_group(settings, "model_config")
 
 
 def _find_config(weights: dict[str, Tensor], settings: dict[str, Any], path: Path) -> tuple[SmartConfig, str]:
@@ -177,7 +175,7 @@ def _vocabulary_note(settings: dict[str, Any], is_published: bool, path: Path) -
     """Note on the vocabulary: published or not, and the file that the checkpoint names.
 
     Raises:
-        CheckpointError: The checkpoint names the published table, and this is another.
+        CheckpointError: The checkpoint names the published table, and the vocabulary is a different table.
     """
     named = find_group(settings, "token_processor").get("agent_token_file")
     if named == PUBLISHED_AGENT_FILE and not is_published:
@@ -185,8 +183,8 @@ def _vocabulary_note(settings: dict[str, Any], is_published: bool, path: Path) -
     note = f"vocabulary: the published {PUBLISHED_AGENT_FILE}" if is_published else "vocabulary: not a published one"
     if named is None:
         return f"{note}; the checkpoint does not say which one it was trained with"
-    is_other = is_published and named != PUBLISHED_AGENT_FILE
-    return f"{note}; the checkpoint names {named}" + (": make sure that it is the same table" if is_other else "")
+    doubt = ": make sure that it is the same table" if is_published and named != PUBLISHED_AGENT_FILE else ""
+    return f"{note}; the checkpoint names {named}{doubt}"
 
 
 def _translate(weights: dict[str, Tensor], expected: dict[str, Tensor], source: str) -> dict[str, Tensor]:

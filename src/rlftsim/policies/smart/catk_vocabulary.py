@@ -28,7 +28,7 @@ _PUBLISHED = {
 
 
 def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
-    """Token tables from npz files, or from one vocabulary file of this package.
+    """Token tables from npz files, or from a vocabulary file of this package.
 
     Args:
         paths: Files of type npz that together hold `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, 11, 2],
@@ -74,7 +74,7 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     """Write the tables as npz, in the form `read_catk_vocabulary` takes.
 
     Args:
-        vocabulary: Vocabulary whose classes have equally many tokens.
+        vocabulary: Vocabulary with equally many tokens in all classes.
         path: Path of the new npz file, written whole or not at all.
 
     Raises:
@@ -94,7 +94,7 @@ def _check_tables(tables: dict[str, np.ndarray], source: str) -> None:
     """Check shapes, types, numbers of tokens and coordinates of the tables.
 
     Raises:
-        CheckpointError: A table is not as the public code has it; the message names the first kind of mistake.
+        CheckpointError: A table differs from the form of the public code; the message names the first kind of mistake.
     """
     shapes = {name: ("V", *_AGENT_SHAPE) for name in MOTION_TABLES} | {MAP_TABLE: ("P", *_MAP_SHAPE)}
     problems = [

@@ -72,8 +72,7 @@ class SmartConfig:
     def seam_rad(self) -> float:
         """Angles this near to -pi count as +pi.
 
-        What lies exactly behind is common (straight lanes, opposite directions) and must not be one or the other by
-        the last bit.
+        Bearings exactly behind are common (straight lanes, opposite directions) and must not depend on the last bit.
         """
         return 0.0 if self.catk_compat else 1e-3
 
@@ -108,7 +107,7 @@ class SmartConfig:
                 else as the model does.
 
         Raises:
-            ConfigError: The model is conditioned in another way.
+            ConfigError: The model is conditioned in a different way.
         """
         if self.goal is None:
             return replace(self, goal=goal, goal_logit_bias=logit_bias is not False)

@@ -1,6 +1,6 @@
 """Dropout with masks drawn from 16-bit integers.
 
-torch draws a random number for each element of a mask, four times as many. Its masks are a tenth of a CAT-K update.
+torch draws a random number for each element of a mask, four times as many. Such masks are a tenth of a CAT-K update.
 """
 
 import torch
@@ -12,7 +12,7 @@ CHANCES = 1 << 16
 
 
 def draw_dropout(x: Float[Tensor, "*shape"], probability: float) -> Float[Tensor, "*shape"]:
-    """Independent factors: zero with a probability, else so large that the mean is one.
+    """Independent factors: zero with a probability, else so large that the mean is 1.
 
     Args:
         x: Tensor with the shape, the type and the device of the factors; no value is read.

@@ -1,7 +1,7 @@
-"""Embeddings of continuous values: small networks over learned Fourier features, and tables of them.
+"""Embeddings of continuous values: small networks over learned Fourier features, and tables of these.
 
-D width, n inputs, E rows (one per relation), F frequencies. Initialization: linear maps Xavier-uniform with zero bias,
-embedding tables N(0, 0.02); frequencies are such a table, or log-spaced.
+D width, n inputs, E rows (a row per relation), F frequencies. Initialization: linear maps Xavier-uniform with zero
+bias, embedding tables N(0, 0.02); frequencies are such a table, or log-spaced.
 """
 
 import math
@@ -28,7 +28,7 @@ def initialize(module: nn.Module, frequency_init: FrequencyInit) -> None:
     """Draw the weights of all linear maps and embedding tables inside a module anew, in the order of `modules()`.
 
     Args:
-        module: Complete network, whose weights are overwritten in place.
+        module: Complete network; weights are overwritten in place.
         frequency_init: "normal" draws the frequencies of Fourier embeddings like any other table. Almost all of these
             have periods of tens of meters, which cannot tell a lane from the next. "log_spaced" sets periods from 64
             down to 1, the same for every input.
@@ -71,7 +71,7 @@ class MlpEmbedding(nn.Sequential):
 
 
 class MlpLayer(nn.Sequential):
-    """[..., n] -> [..., m] through one hidden layer of width D with norm and ReLU."""
+    """[..., n] -> [..., m] through a hidden layer of width D with norm and ReLU."""
 
     def __init__(self, num_inputs: int, dim: int, num_outputs: int):
         super().__init__(nn.Linear(num_inputs, dim), nn.LayerNorm(dim), nn.ReLU(), nn.Linear(dim, num_outputs))
@@ -97,7 +97,7 @@ class FourierEmbedding(nn.Module):
         """Embedding of each row.
 
         Args:
-            values: Inputs of each row, each input in its unit (meters, radians).
+            values: Inputs of each row, in meters and radians.
             extra: Categorical embeddings that join the sum over inputs, before the last map.
         """
         total = self.embed_inputs(values)
@@ -126,7 +126,7 @@ class FourierEmbedding(nn.Module):
 
 @dataclass(frozen=True)
 class Grid:
-    """Values of one input: `count` of them from `start` to `stop`."""
+    """Values of an input: `count` of them from `start` to `stop`."""
 
     start: float
     stop: float
@@ -213,7 +213,7 @@ def tabulate(embedding: FourierEmbedding, reach_m: float, *extra_grids: Grid) ->
 
     Args:
         embedding: Embedding of (distance, bearing, difference of heading, ...), meters and radians.
-        reach_m: Largest distance of the table, meters; a larger distance counts as this one.
+        reach_m: Largest distance of the table, meters; larger distances count as this distance.
         extra_grids: Grids of the inputs that follow these three.
     """
     if not (embedding.is_frozen or embedding.training):

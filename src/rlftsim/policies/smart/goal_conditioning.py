@@ -1,13 +1,13 @@
-"""Goal conditioning of SMART: two encodings of an agent's goal, and a bias of its token logits.
+"""Goal conditioning of SMART: two encodings of an agent's goal, and a bias of the token logits.
 
 * `concat`: distance and bearing of the goal join the continuous state of the agent's token, at every step.
-* `indication`: the relation to the goal's polyline (the map token whose point is nearest to the goal) has a learned
+* `indication`: the relation to the goal's polyline (the map token with the point nearest to the goal) has a learned
   embedding added, at any distance.
 
 With either, a bias may be added to the token logits (`GoalLogitBias`), which is not in the paper. All weights start
-such that a fresh goal-conditioned model decides exactly as the goal-free one.
+such that a fresh goal-conditioned model decides exactly as the goal-free model.
 
-Source: RLFTSim, section 4.2 and its appendix on goal conditioning; docs/decisions.md has what it leaves open.
+Source: RLFTSim, section 4.2 and the appendix on goal conditioning; docs/decisions.md has what these leave open.
 
 B scenarios, N rollouts, A agents, M map tokens, g goal-conditioned rows, C classes, V tokens, D width.
 """
@@ -45,7 +45,7 @@ ROWS_PER_BLOCK_ELSEWHERE = 1 << 12
 
 @dataclass(frozen=True, eq=False)
 class EncodedGoals:
-    """Goals and the map tokens nearest to them."""
+    """Goals, each with the nearest map token."""
 
     position: Float[Tensor, "B N A 2"]
     goal_mask: Bool[Tensor, "B N A"]
@@ -81,14 +81,12 @@ class GoalEmbedding(FourierEmbedding):
 
     def zero_init(self) -> None:
         """Zero the last map: the embedding of any goal is zero."""
-        last = self.out[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        for weight in self.out[-1].parameters():
+            nn.init.zeros_(weight)
 
     @torch.no_grad()
     def init_from(self, relation: FourierEmbedding) -> None:
-        """Copy the networks of another embedding's first two inputs, which must be distance and bearing."""
+        """Copy the networks of a relation embedding's first two inputs, which must be distance and bearing."""
         self.frequencies.weight.copy_(relation.frequencies.weight[:2])
         for layers, trained_layers in zip(self.inputs, relation.inputs):
             layers.load_state_dict(trained_layers.state_dict())
@@ -105,7 +103,7 @@ class GoalEmbedding(FourierEmbedding):
             seam_rad: Width of the seam of angles at -pi, see `relative_pose`.
 
         Returns:
-            The rows whose agents have goals (or all rows), and an embedding of each, zero where there is no goal.
+            The rows of agents with goals (or all rows), and an embedding of each, zero where there is no goal.
         """
         agent = rows[:3]
         has_goal = goals.goal_mask[agent]
@@ -174,28 +172,19 @@ class GoalLogitBias(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(len(CLASS_NAMES), NUM_DECISIONS, 3))
 
-    def zero_init(self) -> None:
-        """Zero the weights: no bias."""
-        nn.init.zeros_(self.weight)
-
     def forward(
-        self,
-        goal: Float[Tensor, "g 2"],
-        num_left: Int64[Tensor, "g"],
-        class_id: Int64[Tensor, "g"],
-        moves: Float[Tensor, "C V 2"],
+        self, features: Float[Tensor, "g 3 V"], num_left: Int64[Tensor, "g"], class_id: Int64[Tensor, "g"]
     ) -> Float[Tensor, "g V"]:
-        """Bias of the logits of all tokens; differentiable in the weights, by the features of `suitability`.
+        """Bias of the logits of all tokens, differentiable in the weights.
 
         Args:
-            goal: Goal of each row, meters, in the frame of its agent.
+            features: Features of each token, from `suitability`.
             num_left: Number of decisions left, the next included, from 1 to 16.
             class_id: Agent class that each row's token ids refer to.
-            moves: Displacement by each token, meters, in the agent's frame.
         """
         weights = BIAS_GAIN * self.weight[class_id, num_left - 1]  # [g, 3]
-        with torch.autocast(goal.device.type, enabled=False):  # logits are float32
-            return (weights[:, None] @ suitability(goal, num_left, class_id, moves))[:, 0]
+        with torch.autocast(features.device.type, enabled=False):  # logits are float32
+            return (weights[:, None] @ features)[:, 0]
 
     def apply_to(
         self,
@@ -214,7 +203,7 @@ class GoalLogitBias(nn.Module):
             poses: Poses of the agents before each decision, map frame, in the shape of the mask.
             num_left: Number of decisions left at each element, the next included, from 1 to 16.
             class_id: Agent class that each agent's token ids refer to.
-            vocabulary: Vocabulary of the tokens, whose boxes give the displacements.
+            vocabulary: Vocabulary of the tokens; the boxes give the displacements.
         """
         elements = find_rows(dist.mask, len(dist.logits) == dist.mask.numel())
         has_goal = goals.goal_mask[elements[:3]]
@@ -224,7 +213,8 @@ class GoalLogitBias(nn.Module):
         goal = rotate(goals.position[rows[:3]] - pose.position, -pose.heading)  # [g, 2], agent's frame
         row_class = class_id[rows[0], rows[2]]
         # a token's displacement is the mean of the four corners of its last box
-        bias = self(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))  # [g, V]
+        features = suitability(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))
+        bias = self(features, num_left[rows], row_class)  # [g, V]
         # tokens of other classes stay impossible
         is_biased = vocabulary.token_mask[row_class] & has_goal[conditioned, None]
         return TokenDistribution(dist.logits.index_add(0, conditioned, bias.masked_fill(~is_biased, 0.0)), dist.mask)
@@ -240,7 +230,7 @@ def suitability(
     """Features of `GoalLogitBias`: progress, minus pace, minus direction; larger for a token that suits better.
 
     Args:
-        goal: Goal of each row, meters, in the frame of its agent.
+        goal: Goal of each row, meters, in the agent's frame.
         num_left: Number of decisions left, the next included, from 1 to 16.
         class_id: Agent class that each row's token ids refer to.
         moves: Displacement by each token, meters, in the agent's frame.
@@ -266,7 +256,7 @@ def suitability(
 def _row_blocks(
     class_id: Int64[Tensor, "g"], moves: Float[Tensor, "C V 2"]
 ) -> Iterator[tuple[Int64[Tensor, "r"] | slice, Float[Tensor, "*r V 2"]]]:
-    """Blocks of rows, each with the moves of its class: on the CPU class by class, elsewhere in the order of rows."""
+    """Blocks of rows, each with the moves of a class: on the CPU class by class, elsewhere in the order of rows."""
     if class_id.device.type == "cpu":
         for index, move in enumerate(moves):
             for rows in (class_id == index).nonzero()[:, 0].split(ROWS_PER_BLOCK):

@@ -1,5 +1,5 @@
-"""Heads beside SMART's own: one per agent class, for vocabularies whose classes have different sizes, and scores of
-tokens by how they continue a motion."""
+"""Further heads of SMART: a head per agent class, for vocabularies with classes of different sizes, and scores of
+tokens by how these continue a motion."""
 
 import math
 from dataclasses import dataclass
@@ -36,32 +36,31 @@ class ClassHeads(nn.ModuleList):
             class_id: Class of each agent, an index into the heads; rows of padding classes are arbitrary.
         """
         logits = torch.full((len(features), self.num_tokens), NEVER, device=features.device)
-        if features.device.type != "cpu":
-            # each head sees all rows: to leave some out, the host would wait for their number
-            for index, (head, size) in enumerate(zip(self, self.class_sizes)):
+        for index, (head, size) in enumerate(zip(self, self.class_sizes)):
+            if features.device.type == "cpu":
+                # each head sees the rows of a single class
+                rows = (class_id == index).nonzero()[:, 0]
+                logits[rows, :size] = head(features[rows]).float()
+            else:
+                # each head sees all rows: to leave some out, the host would wait for their number
                 class_logits = functional.pad(head(features).float(), (0, self.num_tokens - size), value=NEVER)
                 # padding, whose class has no head, gets arbitrary logits
                 logits = torch.where((class_id >= index)[:, None], class_logits, logits)
-            return logits
-        for index, (head, size) in enumerate(zip(self, self.class_sizes)):
-            # each head sees the rows of its class only
-            rows = (class_id == index).nonzero()[:, 0]
-            logits[rows, :size] = head(features[rows]).float()
         return logits
 
 
 class ContinuationScores(nn.Module):
-    """A second term of the logits: scores of tokens by how they change the agent's speed, and by where they turn.
+    """A second term of the logits: scores of tokens by changes of the agent's speed and direction.
 
-    SMART's head has a free vector for each token and learns from every speed anew that agents mostly go on as they
-    went; speeds that few training scenarios have stay unknown, and agents fall back to common speeds. Here token v is
+    SMART's head has a free vector for each token and learns from every speed anew that agents mostly go on as
+    before; speeds that few training scenarios have stay unknown, and agents fall back to common speeds. Here token v is
     scored by how much farther the end m_v lies along the heading than the end of the last token u, and by the end
     across the heading and the turn, which the road decides and not the last turn: a Fourier series
 
         sum over frequencies w of  a_w cos(w d) + b_w sin(w d),
 
-    where d = m_v - m_u along the heading and d = m_v across it and in heading, and a and b are linear in the agent's
-    features. What is learned about accelerating holds at any speed, and tokens that lead to nearly the same place are
+    where d = m_v - m_u along the heading and d = m_v across the heading and in turn, and a and b are linear in the
+    agent's features. A lesson about accelerating holds at any speed, and tokens that lead to nearly the same place are
     learned together. By the addition theorems this is the product of a key, which depends on v alone, and of a query
     that is turned by the phase of u, as in rotary position embeddings.
     """
@@ -99,7 +98,7 @@ class ContinuationScores(nn.Module):
         Args:
             hidden: Features that the last map of SMART's head reads, a row per agent.
             last_phase: Phase of the token that led to the current step, from `TokenKeys`, radians.
-            class_id: Class of each agent, which selects the keys that its query applies to.
+            class_id: Class of each agent, which selects the keys of the agent's query.
         """
         a, b = self.query(hidden).chunk(2, -1)  # [R, F]
         cos, sin = last_phase.cos(), last_phase.sin()

@@ -1,13 +1,12 @@
-"""Weights and settings of a Lightning checkpoint, without running anything that the file holds.
+"""Weights and settings of a Lightning checkpoint, without running code of the file.
 
 Such files are pickles, read through torch's restricted unpickler. The few foreign classes that hold settings
-(OmegaConf) are replaced by name with an inert stand-in, all others are refused.
+(OmegaConf) are replaced by name with an inert stand-in, all further classes are refused.
 """
 
 import collections
 import typing
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from rlftsim.jobs.documents import first_line
 
 
 class _Inert:
-    """Stand-in for foreign classes: holds the state of an object and runs nothing."""
+    """Stand-in for foreign classes: holds the state of an object and runs no code."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -41,17 +40,8 @@ _HARMLESS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class LightningFile:
-    """Weights and settings of a Lightning checkpoint."""
-
-    weights: dict[str, Tensor]
-    settings: dict[str, Any]
-    """The file's `hyper_parameters` as plain dictionaries, lists and values; empty where there are none."""
-
-
-def read_lightning(path: Path) -> LightningFile:
-    """Read weights and settings of a Lightning checkpoint.
+def read_lightning(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights of a Lightning checkpoint, and the file's `hyper_parameters` as plain dictionaries, lists and values.
 
     Raises:
         CheckpointError: No such file, not a checkpoint, no weights inside, or objects that would have to run code to
@@ -65,7 +55,7 @@ def read_lightning(path: Path) -> LightningFile:
         settings = _plain(content.get("hyper_parameters", {}))
     except RecursionError:
         raise CheckpointError(f"{path}: damaged, its settings hold themselves: get the file again.") from None
-    return LightningFile(dict(weights), settings if isinstance(settings, dict) else {})
+    return dict(weights), settings if isinstance(settings, dict) else {}
 
 
 def find_group(settings: dict[str, Any], name: str) -> dict[str, Any]:
@@ -75,7 +65,7 @@ def find_group(settings: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _is_weight(name: object, value: Any) -> bool:
-    """True for a dense tensor on the CPU whose values are all stored: views may announce more than memory holds."""
+    """True for a dense tensor on the CPU with all values stored: views may announce more than memory holds."""
     if not isinstance(name, str) or type(value) not in (Tensor, nn.Parameter) or value.layout != torch.strided:
         return False
     return value.device.type == "cpu" and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
@@ -107,7 +97,7 @@ def _unpickle(path: Path) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Settings as plain dictionaries, lists and values; anything else becomes None."""
+    """Settings as plain dictionaries, lists and values; values of other types become None."""
     if isinstance(value, _Inert):
         # OmegaConf keeps containers in `_content` and values in `_val`
         state = value.__dict__

@@ -1,4 +1,4 @@
-"""SMART's weights and vocabulary, their files, and variants with goals.
+"""SMART's weights and vocabulary, the files, and variants with goals.
 
 A agents, B scenarios, N rollouts, D width, R selected elements, V tokens.
 """
@@ -76,7 +76,7 @@ class SmartModel(nn.Module):
         return self.network.decoder.goal_modules()
 
     def sees_as(self, model: nn.Module) -> bool:
-        """True if scenes, and relations of rows to scenes, are the same for another model, without gradient in both.
+        """True if scenes, and relations of rows to scenes, are the same for a second model, without gradient in both.
 
         The weights that compute these are frozen in both models, and equal. The layers of the decoder, the head and the
         goal modules may differ.
@@ -95,7 +95,7 @@ class SmartModel(nn.Module):
         return self.config.goal is not None
 
     def with_goal_conditioning(self: Model, encoding: GoalEncoding, *, logit_bias: bool | None = None) -> Model:
-        """Copy with goal-conditioning weights that have no effect yet; the model itself if conditioned in this way.
+        """Copy with goal-conditioning weights that have no effect yet; the model unchanged if conditioned in this way.
 
         Args:
             encoding: Encoding of goals, "concat" or "indication".
@@ -103,7 +103,7 @@ class SmartModel(nn.Module):
                 yes for a goal-free model, else as the model does.
 
         Raises:
-            ConfigError: The model is conditioned in another way.
+            ConfigError: The model is conditioned in a different way.
         """
         config = self.config.with_goal_conditioning(encoding, logit_bias)
         if config == self.config:
@@ -154,12 +154,12 @@ class SmartModel(nn.Module):
 
     @classmethod
     def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
-        """Model of a model folder as `save_pretrained` writes it, or of a run's folder, in training mode.
+        """Model of a model folder as written by `save_pretrained`, or of a run's folder, in training mode.
 
         Raises:
             ConfigError: There is no such folder, or the settings contradict each other.
-            CheckpointError: A missing or damaged file, another architecture, or keys and shapes that do not fit, the
-                first of which are named.
+            CheckpointError: A missing or damaged file, a different architecture, or keys and shapes that do not fit;
+                the first are named.
         """
         model = read_model(folder, architecture=cls.architecture)
         config, weights = model.build(SmartConfig), model.read_weights()

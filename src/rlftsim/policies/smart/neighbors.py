@@ -1,6 +1,6 @@
 """Neighbor search: padded lists of sources within a radius, and the geometry of each relation.
 
-R rows that attend, K neighbors of a row, P sets of C candidates each. Lists are padded where their mask is False. A
+R rows that attend, K neighbors of a row, P sets of C candidates each. Lists are padded where the mask is False. A
 set holds the candidates of a scenario, or of a scenario, rollout and step: a row has neighbors in a single set.
 """
 
@@ -67,7 +67,7 @@ class RowGroups:
 
 
 def group_rows(set_index: Int64[Tensor, "R"], poses: Poses) -> RowGroups:
-    """Groups of rows whose candidate set and pose are equal to the last bit; on the CPU.
+    """Groups of rows with candidate set and pose equal to the last bit; on the CPU.
 
     Args:
         set_index: Candidate set of each row, an index into the first axis of the candidates.
@@ -90,26 +90,30 @@ def find_neighbors(
     limit: int | None,
     max_neighbors: int | None = None,
 ) -> Neighbors:
-    """Candidates nearer than a radius (strictly), or the nearest of them where a limit binds.
+    """Candidates nearer than a radius (strictly), or the nearest where a limit binds.
 
-    Of equally near candidates the first counts. Lists have at least one entry (K >= 1), padding where no row has a
+    Of equally near candidates the first counts. Lists have entries (K >= 1), padding where no row has a
     neighbor.
 
     Args:
         position: Finite positions of the rows, meters, in the frame of the candidates.
         set_index: Candidate set of each row, an index into the first axis of the candidates.
-        candidates: Positions, meters, infinite for padding. Neighbors are named by their flat index p * C + c.
-        self_index: Candidate of the set that is the row itself, and no neighbor; None = no row is a candidate.
+        candidates: Positions, meters, infinite for padding. Neighbors are named by the flat index p * C + c.
+        self_index: Candidate of the set that is the row, and no neighbor; None = no row is a candidate.
         radius_m: Radius of the circle around a row in which neighbors lie, meters.
-        limit: Largest number of neighbors of a row, the nearest of them; None = all within the radius.
+        limit: Largest number of neighbors of a row, the nearest candidates; None = all within the radius.
         max_neighbors: Bound on the candidates within the radius of a row, see `bound_neighbors`. Off the CPU lists are
-            then as wide, and the host need not wait for their width.
+            then as wide, and the host need not wait for the width.
     """
     num_candidates, is_on_cpu = candidates.shape[1], position.device.type == "cpu"
     cut = _patches if is_on_cpu and num_candidates >= MANY_CANDIDATES else _blocks
     lists = []
     for view in cut(position, set_index, candidates, radius_m):
-        squared = _squared_distances(view, position, self_index)
+        # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
+        squared = (view.x - position[view.rows, :1]).square_()
+        squared += (view.y - position[view.rows, 1:]).square_()
+        if self_index is not None:
+            squared.masked_fill_(view.columns == self_index[view.rows, None], torch.inf)
         if limit is not None:
             neighbors = _select_nearest(squared, radius_m, limit)
         elif is_on_cpu:
@@ -155,24 +159,12 @@ def bound_neighbors(candidates: Float[Tensor, "P C 2"], radius_m: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Rows that are searched together, and their candidates: positions [r, c], or [1, c] if shared by all rows."""
+    """Rows that are searched together, and the candidates: positions [r, c], or [1, c] if shared by all rows."""
 
     rows: Int64[Tensor, "r"]
     columns: Int64[Tensor, "c"]
     x: Float[Tensor, "_ c"]
     y: Float[Tensor, "_ c"]
-
-
-def _squared_distances(
-    view: View, position: Float[Tensor, "R 2"], self_index: Int64[Tensor, "R"] | None
-) -> Float[Tensor, "r c"]:
-    """Squared distances between rows and candidates of a view, infinite from a row to itself."""
-    # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
-    squared = (view.x - position[view.rows, :1]).square_()
-    squared += (view.y - position[view.rows, 1:]).square_()
-    if self_index is not None:
-        squared.masked_fill_(view.columns == self_index[view.rows, None], torch.inf)
-    return squared
 
 
 def _blocks(
@@ -222,11 +214,11 @@ def _select_nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) 
 
 
 def _select_within(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
-    """All candidates within the radius, in the order of their columns."""
-    is_near = squared < radius_m**2
-    count = is_near.sum(-1, keepdim=True)
-    column = is_near.nonzero()[:, 1]  # of all rows, one row after the other
-    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=is_near.device)
+    """All candidates within the radius, in the order of columns."""
+    is_inside = squared < radius_m**2
+    count = is_inside.sum(-1, keepdim=True)
+    column = is_inside.nonzero()[:, 1]  # of all rows, one row after the other
+    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=is_inside.device)
     mask = columns < count
     # position of each list's entries among these; padding repeats any
     entry = (count.cumsum(0) - count + columns).clamp(max=max(len(column) - 1, 0))
@@ -235,15 +227,15 @@ def _select_within(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
 
 def _select_bounded(squared: Float[Tensor, "r C"], radius_m: float, max_neighbors: int | None) -> Neighbors:
     """As `_select_within`, in lists of `max_neighbors` entries; without that bound the host waits for the count."""
-    is_near = squared < radius_m**2
-    columns = torch.arange(squared.shape[1], device=is_near.device).expand(is_near.shape)
-    width = int(is_near.sum(-1).max()) if max_neighbors is None else max_neighbors
+    is_inside = squared < radius_m**2
+    columns = torch.arange(squared.shape[1], device=is_inside.device).expand(is_inside.shape)
+    width = int(is_inside.sum(-1).max()) if max_neighbors is None else max_neighbors
     if width >= squared.shape[1]:
-        return Neighbors(columns, is_near)
-    count = is_near.cumsum(-1)
+        return Neighbors(columns, is_inside)
+    count = is_inside.cumsum(-1)
     # the first neighbor goes to the first entry, and so on; all others to one more entry, which is cut off
-    index = columns.new_zeros(len(is_near), width + 1)
-    index.scatter_(1, torch.where(is_near, count - 1, width), columns)
+    index = columns.new_zeros(len(is_inside), width + 1)
+    index.scatter_(1, torch.where(is_inside, count - 1, width), columns)
     return Neighbors(index[:, :width], columns[:, :width] < count[:, -1:])
 
 

@@ -1,12 +1,12 @@
 """The network of SMART: a map encoder, and a decoder over agents and token steps.
 
 B scenarios, N rollouts, A agents, K token steps of a block, P of the past, M map tokens, D width, C classes, V
-tokens. What attends is a *row*: a valid (scenario, rollout, agent, step), flattened, R in all. The decoder works on a
+tokens. A *row* attends: a valid (scenario, rollout, agent, step), flattened, R in all. The decoder works on a
 block of steps given the past. So the history (once per scenario), a single step of a rollout and all steps of a scoring
 pass go through the same code.
 
 In closed loop off the CPU all elements of a block are rows, padding too. Then no shape depends on a value: the host
-never waits inside a decision, and all decisions of a rollout are one CUDA graph.
+never waits inside a decision, and all decisions of a rollout are a single CUDA graph.
 """
 
 import itertools
@@ -145,7 +145,7 @@ class Past:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The rows of a block of steps, and their neighbors with the relations to them."""
+    """The rows of a block of steps, and the neighbors of each with the relations."""
 
     rows: tuple[Tensor, ...]
     """Scenario, rollout, agent and step [R] of each row."""
@@ -421,7 +421,7 @@ class AgentDecoder(nn.Module):
         return values, row.clamp(min=0), mask
 
     def _build_goal_edges(self, scene: Scene, view: View, goals: EncodedGoals | None) -> GoalEdges | None:
-        """Relations to each agent's goal polyline; None with another encoding, or if no agent has a goal."""
+        """Relations to each agent's goal polyline; None with a different encoding, or if no agent has a goal."""
         if goals is None or not isinstance(self.goal, GoalEdgeEmbedding):
             return None
         polyline = goals.polyline[view.rows[:3]]
@@ -451,8 +451,8 @@ class SmartNetwork(nn.Module):
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self, config.frequency_init)
-        for module in self.decoder.goal_modules():
-            module.zero_init()
+        if self.decoder.goal is not None:
+            self.decoder.goal.zero_init()
 
     def scene_weights(self) -> list[Tensor]:
         """Weights that scenes and views are made with: all but those of the decoder's `reader_modules`."""

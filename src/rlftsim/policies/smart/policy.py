@@ -17,9 +17,9 @@ from rlftsim.policies.distributions import CategoricalDistribution, TokenDistrib
 from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, encode_goals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
-from rlftsim.policies.smart.network import mask_positions
-from rlftsim.policies.smart.state import Replay, SmartContext, SmartState, TeacherForced
-from rlftsim.policies.smart.token_steps import TokenSteps, match_imposed, place_tokens
+from rlftsim.policies.smart.network import View, mask_positions
+from rlftsim.policies.smart.state import SmartContext, SmartState, TeacherForced
+from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions
 from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -47,7 +47,7 @@ class SmartPolicy(SmartModel):
         return f"{type(self).__name__}({sum(weight.numel() for weight in self.parameters()):,} weights, {goals})"
 
     def encode(self, scenarios: ScenarioBatch) -> SmartContext:
-        """Map features, history tokens and their decoder features, for goal-free agents."""
+        """Map features, history tokens and decoder features, for goal-free agents."""
         tokens = self._tokenize(scenarios)
         scene = self._build_scene(scenarios)
         history = self._logged_steps(tokens, slice(0, HISTORY_TOKENS))
@@ -59,8 +59,6 @@ class SmartPolicy(SmartModel):
             view=view,
             past=past,
             features=place_rows(rows, history.valid)[:, 0, :, -1],
-            position=tokens.position[:, :, HISTORY_TOKENS - 1],
-            heading=tokens.heading[:, :, HISTORY_TOKENS - 1],
             object_type=scenarios.object_type,
             token_class=torch.where(scenarios.agent_mask, scene.class_id, PADDING_CLASS),
             agent_mask=scenarios.agent_mask,
@@ -76,11 +74,8 @@ class SmartPolicy(SmartModel):
             goals: Goals [B, N, A] of all agents, map frame; ignored by a goal-free model. None = goal-free.
             noise: Empty tensor, since the start of a simulation is not random.
         """
-
-        def repeated(v: Tensor) -> Tensor:
-            return v[:, None].expand(-1, num_rollouts, *v.shape[1:])
-
-        position, heading = repeated(context.position), repeated(context.heading)
+        current = context.history.last.repeat(num_rollouts)
+        position, heading = current.position[:, :, :, 0], current.heading[:, :, :, 0]
         if goals is None or not self.is_goal_conditioned or not goals.any:
             return SmartState(position, heading, context.past.repeat(num_rollouts), pending=None)
         # the context is goal-free: the current step goes through the decoder again, with goals; earlier steps do not
@@ -88,7 +83,7 @@ class SmartPolicy(SmartModel):
             position,
             heading,
             context.past.without_last_step().repeat(num_rollouts),
-            pending=context.history.last.repeat(num_rollouts),
+            pending=current,
             goals=encode_goals(goals, mask_positions(context.scene.map_mask, context.scene.map_position)),
         )
 
@@ -97,7 +92,7 @@ class SmartPolicy(SmartModel):
 
         Args:
             context: Result of `encode` for the scenarios.
-            state: State before the decision, whose cache is filled.
+            state: State before the decision; the cache of the state is filled.
         """
         mask = context.agent_mask[:, None].expand(state.heading.shape)
         num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
@@ -120,15 +115,12 @@ class SmartPolicy(SmartModel):
             context: Result of `encode` for the scenarios.
             state: State before the decision, which stays as it is.
             decision: Id of the token that each agent takes, within the agent's class.
-            forced: States [B, N, A, 5] imposed from outside; only agents whose five states are all valid are imposed.
+            forced: States [B, N, A, 5] imposed from outside; only agents with five valid states are imposed.
         """
-        start = (state.position, state.heading, context.object_type, self.vocabulary)
-        poses = place_tokens(decision, *start, catk_compat=self.config.catk_compat)  # [B, N, A, 5, 3]
-        if forced is not None:
-            imposed = forced.valid.all(-1)
-            forced_poses = torch.cat([forced.position, forced.heading[..., None]], -1)
-            poses = torch.where(imposed[..., None, None], forced_poses, poses)
-            decision = match_imposed(decision, imposed, poses[..., -1, :], *start)
+        poses, decision = apply_decisions(
+            decision, state.position, state.heading, context.object_type, self.vocabulary, forced,
+            catk_compat=self.config.catk_compat,
+        )  # fmt: skip
         position, heading = poses[..., -1, :2], poses[..., -1, 2]
         block = TokenSteps(
             position=position[..., None, :],
@@ -147,16 +139,19 @@ class SmartPolicy(SmartModel):
         return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
     def score(self, context: SmartContext, rollouts: Rollouts) -> CategoricalDistribution:
-        """Distributions [B, N, A, L] along rollouts: one pass of the decoder over all steps.
+        """Distributions [B, N, A, L] along rollouts: a single pass of the decoder over all steps.
 
         Args:
             context: Result of `encode` for the scenarios.
             rollouts: Rollouts of the same scenarios, by this policy or another.
         """
-        return self._score(context, self._replay(context, rollouts))
+        return self._score(context, *self._replay(context, rollouts))
 
-    def _replay(self, context: SmartContext, rollouts: Rollouts) -> Replay:
-        """Repeat the decisions of rollouts without the decoder, and look around at every step."""
+    def _replay(self, context: SmartContext, rollouts: Rollouts) -> tuple[SmartState, View | None]:
+        """State before the last decision of rollouts, and a view of the steps, all pending; None = there are none.
+
+        The decoder is not run: but for the past, no value depends on weights that fine-tuning trains.
+        """
         state = self.begin(context, rollouts.num_rollouts, rollouts.goals, rollouts.log_prob[..., :0])
         # the last decision leads nowhere that is scored
         for index in range(rollouts.decision.shape[3] - 1):
@@ -164,19 +159,17 @@ class SmartPolicy(SmartModel):
             forced = rollouts.forced and rollouts.forced.steps(start, start + STEPS_PER_TOKEN)
             state = self.advance(context, state, rollouts.decision[..., index], forced)
         steps = state.pending
-        view = None if steps is None else self.network.decoder.look(context.scene, steps, state.past)
-        return Replay(state, view)
+        return state, None if steps is None else self.network.decoder.look(context.scene, steps, state.past)
 
-    def _score(self, context: SmartContext, replay: Replay) -> CategoricalDistribution:
+    def _score(self, context: SmartContext, state: SmartState, view: View | None) -> CategoricalDistribution:
         """Distributions along rollouts that have been replayed, by this model or by a model that sees alike."""
-        state = replay.state
         # 1. features [B, N, A, L, D]: of the current step, from the context for goal-free agents, and of later steps
         blocks = []
         if state.goals is None:
             blocks.append(context.features[:, None, :, None].expand(*state.heading.shape, 1, -1))
         if state.pending is not None:
             past = replace(state.past, sources=context.past.sources)
-            rows, _ = self.network.decoder(context.scene, state.pending, past, replay.view, state.goals)
+            rows, _ = self.network.decoder(context.scene, state.pending, past, view, state.goals)
             blocks.append(place_rows(rows, state.pending.valid))
         features = torch.cat(blocks, 3)
         # 2. distributions of the agents; padding is left out
@@ -195,7 +188,7 @@ class SmartPolicy(SmartModel):
 
         Args:
             scenarios: Scenarios that `context` was encoded from, in the same order.
-            context: Context of any policy whose weights have not changed since.
+            context: Context of any policy with weights that have not changed since.
         """
         if not isinstance(context, SmartContext) or not self.sees_as(context.model):
             return self.encode(scenarios)
@@ -218,11 +211,11 @@ class SmartPolicy(SmartModel):
             ref_rollouts: The same rollouts, maybe with other goals.
         """
         replay = self._replay(context, rollouts)
-        dist = self._score(context, replay)
+        dist = self._score(context, *replay)
         with torch.no_grad():
             is_shared = isinstance(ref_context, SmartContext) and ref_context.scene is context.scene
             if is_shared and ref_rollouts is rollouts:
-                return dist, reference._score(ref_context, replay)
+                return dist, reference._score(ref_context, *replay)
             return dist, reference.score(ref_context, ref_rollouts)
 
     # ---- pre-training -------------------------------------------------------------------------------------------

@@ -21,16 +21,13 @@ class SmartContext:
 
     scene: Scene
     history: TokenSteps
-    """The two history tokens, the last of them at the current step; with a single rollout."""
+    """The two history tokens of a single rollout. The last ends at the current step, near the logged position."""
     view: View
     """Of the history."""
     past: Past
     """Of the history."""
     features: Float[Tensor, "B A D"]
     """Decoder features at the current step of goal-free agents; zeros for padding."""
-    position: Float[Tensor, "B A 2"]
-    """End of the last history token, which is near the logged position, not at it."""
-    heading: Float[Tensor, "B A"]
     object_type: Int64[Tensor, "B A"]
     token_class: Int64[Tensor, "B A"]
     """Class that an agent's token ids refer to."""
@@ -77,16 +74,6 @@ class SmartState:
     num_decisions: int = 0
     """Decisions taken so far."""
     cache: DecoderCache = field(default_factory=DecoderCache)
-
-
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """Rollouts ready to be scored. But for the past, no value depends on weights that fine-tuning trains."""
-
-    state: SmartState
-    """Before the last decision, all steps that are to be scored pending."""
-    view: View | None
-    """Of the pending steps; None = there are none."""
 
 
 @dataclass(frozen=True, eq=False)

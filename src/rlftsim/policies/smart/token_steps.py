@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
+from rlftsim.rollout.types import AgentStates
 from rlftsim.tokens import catk_compat as catk_ops
 from rlftsim.tokens.agent_tokens import AgentTokens, class_boxes, nearest_tokens
 from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
@@ -60,23 +61,28 @@ def build_logged_steps(tokens: AgentTokens, steps: slice, *, catk_compat: bool) 
     return TokenSteps(*(v[:, None, :, steps] for v in fields))
 
 
-def place_tokens(
+def apply_decisions(
     decision: Int64[Tensor, "B N A"],
     position: Float[Tensor, "B N A 2"],
     heading: Float[Tensor, "B N A"],
     object_type: Int64[Tensor, "B A"],
     vocabulary: Vocabulary,
+    forced: AgentStates | None,
     *,
     catk_compat: bool,
-) -> Float[Tensor, "B N A 5 3"]:
-    """The five poses (x, y, heading) of the chosen tokens, placed at the current states. Padding stands still.
+) -> tuple[Float[Tensor, "B N A 5 3"], Int64[Tensor, "B N A"]]:
+    """The five poses (x, y, heading) of a decision, and the decisions. Padding stands still.
+
+    Poses are those of the chosen tokens, placed at the current states. Imposed agents get the imposed poses, and the
+    nearest token as the decision, as if that token had been chosen.
 
     Args:
         decision: Id of the token that each agent takes, within the agent's class.
         position: Positions before the decision, meters.
         heading: Headings before the decision, radians.
-        object_type: Object type of each agent, which decides the token class.
+        object_type: Object type of each agent, which decides the box and the token class.
         vocabulary: Vocabulary that the token ids refer to.
+        forced: States [B, N, A, 5] imposed from outside; only agents with five valid states are imposed.
         catk_compat: Order of operations of the public code, which places boxes and takes poses from the corners.
     """
     class_id = class_of_type(object_type)[:, None].expand(decision.shape)
@@ -89,31 +95,14 @@ def place_tokens(
         # without a turn the heading keeps its bits: agents at the same pose share a list of neighbors
         turn, start = local[..., 2], heading[..., None]
         new_heading = torch.where(turn == 0, start, wrap_angle(start + turn))
-    return torch.cat([new_position, new_heading[..., None]], -1)
-
-
-def match_imposed(
-    decision: Int64[Tensor, "B N A"],
-    imposed: Bool[Tensor, "B N A"],
-    end: Float[Tensor, "B N A 3"],
-    position: Float[Tensor, "B N A 2"],
-    heading: Float[Tensor, "B N A"],
-    object_type: Int64[Tensor, "B A"],
-    vocabulary: Vocabulary,
-) -> Int64[Tensor, "B N A"]:
-    """Decisions, replaced for imposed agents by the nearest token, as if these agents had chosen that token.
-
-    Args:
-        decision: Id of the token that each agent took, within the agent's class.
-        imposed: True = the agent's poses came from outside.
-        end: Last pose (x, y, heading) of the step, meters and radians.
-        position: Positions before the step, meters.
-        heading: Headings before the step, radians.
-        object_type: Object type of each agent, which decides the box and the token class.
-        vocabulary: Vocabulary that the token ids refer to.
-    """
+    poses = torch.cat([new_position, new_heading[..., None]], -1)
+    if forced is None:
+        return poses, decision
+    is_imposed = forced.valid.all(-1)
+    forced_poses = torch.cat([forced.position, forced.heading[..., None]], -1)
+    poses = torch.where(is_imposed[..., None, None], forced_poses, poses)
     length, width = class_boxes(object_type)
-    corners = box_corners(end[..., :2], end[..., 2], length[:, None], width[:, None])  # [B, N, A, 4, 2]
+    end_position, end_heading = poses[..., -1, :2], poses[..., -1, 2]
+    corners = box_corners(end_position, end_heading, length[:, None], width[:, None])  # [B, N, A, 4, 2]
     local = rotate(corners - position[..., None, :], -heading[..., None])
-    class_id = class_of_type(object_type)[:, None].expand(imposed.shape)
-    return torch.where(imposed, nearest_tokens(local, class_id, imposed, vocabulary), decision)
+    return poses, torch.where(is_imposed, nearest_tokens(local, class_id, is_imposed, vocabulary), decision)
