@@ -7,8 +7,6 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.goal_outcomes import read_rollouts, report_outcomes
-from rlftsim.cli.goals import given_goals, warn_of_doubts
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import check_jobs
 from rlftsim.evaluation.exporters import exporter_by_name
@@ -19,6 +17,8 @@ from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.policy import Sampling, get_device, is_goal_conditioned
 from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.open import check_splits, open_dataset
+from rlftsim.verbs.goal_outcomes import read_rollouts, report_outcomes
+from rlftsim.verbs.goals import read_given_goals, warn_of_doubts
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Simulate:
         check_jobs(self.jobs, get_device(policy), "jobs")
         sampling = Sampling(self.temperature, self.top_k)
         scenarios = open_dataset(self.data, self.split)
-        goals = given_goals(self.goals, self.goal, self.scenario)
+        goals = read_given_goals(self.goals, self.goal, self.scenario)
         if goals.goals and not is_goal_conditioned(policy):
             raise ConfigError(
                 f"{self.model} is not goal-conditioned, {len(goals.goals)} goals would have no effect: take a model "

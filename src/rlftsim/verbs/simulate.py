@@ -1,12 +1,10 @@
-"""Public `simulate` and `score`: the closed loop and the metric for scenarios and rollouts in any form."""
+"""`rs.simulate`: the closed loop for scenarios, policies and goals in any form."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 
-from rlftsim._api.sources import batch_of, policy_of
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.evaluate import frozen_copy
 from rlftsim.goals.maneuvers.reach import HORIZON_S
@@ -20,6 +18,7 @@ from rlftsim.rollout.types import RolloutProvenance, Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, Name
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.verbs.inputs import to_batch, to_policy, to_sampling
 
 
 def simulate(
@@ -36,30 +35,30 @@ def simulate(
     The same seed gives the same rollouts as `rlftsim simulate`, whatever other scenarios are handed over with one.
 
     Args:
-        policy: a policy, simulated as in evaluation mode, or a name for `load_policy`.
-        scenarios: one scenario, several, a batch or a data set, all of which are in memory at once; a name of a data
+        policy: Policy, simulated as in evaluation mode, or a name for `load_policy`.
+        scenarios: One scenario, several, a batch or a data set, all of which are in memory at once; a name of a data
             set stands for its split validation. Only history, map and lights are used.
-        num_rollouts: N, futures of every scenario.
-        seed: of all randomness.
-        goals: points that agents drive to, meters in the world frame: {object_id: (x, y)}, and for several scenarios
+        num_rollouts: Number N of futures of every scenario.
+        seed: Seed of all randomness.
+        goals: Points that agents drive to, meters in the world frame: {object_id: (x, y)}, and for several scenarios
             {scenario_id: {object_id: (x, y)}}. Or goals of the whole batch as tensors.
-        sampling: temperature and truncation; None samples the whole distribution.
+        sampling: Temperature and truncation; None samples the whole distribution.
 
     Returns:
         Rollouts with padding up to the scenario with the most agents. They know their scenarios and seed
         (`provenance`), and `trajectory(object_id)` gives an agent's poses in the world frame.
 
     Raises:
-        ConfigError: no scenario, fewer than one rollout, goals for a policy that is not goal-conditioned, for
+        ConfigError: No scenario, fewer than one rollout, goals for a policy that is not goal-conditioned, for
             scenarios that were not handed over or in another frame.
-        DataError: a goal of an agent that is not simulated, out of its reach, or not two finite numbers.
+        DataError: A goal of an agent that is not simulated, out of its reach, or not two finite numbers.
     """
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed)
-    sampling = sampling_of(sampling)
-    policy = policy_of(policy)
+    sampling = to_sampling(sampling)
+    policy = to_policy(policy)
     if is_training(policy):  # with dropout a seed would not say what happens
         policy = frozen_copy(policy)
-    batch = batch_of(scenarios, get_device(policy))
+    batch = to_batch(scenarios, get_device(policy))
     if not isinstance(goals, Goals | Mapping | None):
         raise ConfigError(
             f"goals must be {{object_id: (x, y)}}, {{scenario_id: {{object_id: (x, y)}}}} or Goals, got {goals!r}."
@@ -83,7 +82,7 @@ def simulate(
         )
     has_goals = placed.goal_mask.any(-1).any(-1).tolist()  # [B]
     if any(has_goals):  # else there may be no agent at all
-        _refuse_far(placed, batch)
+        _check_reach(placed, batch)
         if not is_goal_conditioned(policy):
             raise ConfigError(
                 f"goals have no effect: {type(policy).__name__} is not goal-conditioned: load a model that was "
@@ -91,16 +90,19 @@ def simulate(
             )
     # One scenario at a time, as the command line does: memory does not grow with the number of scenarios that are in
     # the loop, and no result depends on the company of a scenario.
-    parts = []
+    simulated = []
     with progress_bar("simulate", batch.num_scenarios, show=batch.num_scenarios > 1) as advance:
-        for row, one in enumerate(batch.split(1)):
-            own = None
+        for row, scenario_batch in enumerate(batch.split(1)):
+            scenario_goals = None
             if has_goals[row]:
-                here = slice(row, row + 1)
-                own = replace(placed, position=placed.position[here], goal_mask=placed.goal_mask[here])
-            parts.append(
-                simulate_batch(policy, one, num_rollouts=num_rollouts, seed=seed, goals=own, sampling=sampling)
-            )
+                rows = slice(row, row + 1)
+                scenario_goals = replace(placed, position=placed.position[rows], goal_mask=placed.goal_mask[rows])
+            simulated.append(
+                simulate_batch(
+                    policy, scenario_batch, num_rollouts=num_rollouts, seed=seed, goals=scenario_goals,
+                    sampling=sampling,
+                )
+            )  # fmt: skip
             advance()
     # All batches of one scenario are padded alike (`split`), so they can be joined along axis B.
     provenance = RolloutProvenance(
@@ -113,36 +115,26 @@ def simulate(
         top_k=sampling.top_k,
     )
     tensors = ("position", "heading", "decision", "decision_mask", "log_prob")
-    if parts[0].draws is not None:
+    if simulated[0].draws is not None:
         tensors = (*tensors, "draws")
-    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in tensors}
-    kept_goals = placed.repeat(num_rollouts) if any(has_goals) else None
-    return replace(parts[0], **joined, goals=kept_goals, provenance=provenance)
+    joined = {name: torch.cat([getattr(rollouts, name) for rollouts in simulated]) for name in tensors}
+    all_goals = placed.repeat(num_rollouts) if any(has_goals) else None
+    return replace(simulated[0], **joined, goals=all_goals, provenance=provenance)
 
 
-def sampling_of(sampling: Any) -> Sampling:
-    """Temperature and truncation; the defaults for None.
-
-    Raises:
-        ConfigError: something else.
-    """
-    if not isinstance(sampling, Sampling | None):
-        raise ConfigError(f"sampling must be rs.Sampling(temperature, top_k) or None, got {sampling!r}.")
-    return sampling or Sampling()
-
-
-def _refuse_far(goals: Goals, batch: ScenarioBatch) -> None:
+def _check_reach(goals: Goals, batch: ScenarioBatch) -> None:
     """Refuse goals that nothing reaches in 8 seconds: mostly points of another frame.
 
     Raises:
-        DataError: there is one; names the agent.
+        DataError: Such a goal; names the agent.
     """
     offset = goals.position - batch.position[:, None, :, CURRENT_STEP]  # [B, N, A, 2]
     distance = torch.where(goals.goal_mask, offset.norm(dim=-1), 0.0).amax(1)  # [B, A]
     row, agent = divmod(int(distance.argmax()), distance.shape[1])
-    away = float(distance[row, agent])
-    if away > FASTEST_MPS * HORIZON_S:
+    distance_m = float(distance[row, agent])
+    if distance_m > FASTEST_MPS * HORIZON_S:
         raise DataError(
             f"goal of agent {int(batch.object_id[row, agent])} in scenario {batch.scenarios[row].scenario_id} is "
-            f"{away:.0f} m away, out of reach in {HORIZON_S:g} s: x and y are meters in the world frame of the log."
+            f"{distance_m:.0f} m away, out of reach in {HORIZON_S:g} s: x and y are meters in the world frame of the "
+            "log."
         )
