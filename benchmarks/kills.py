@@ -30,12 +30,19 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-from rlftsim.cli import augment, simulate  # noqa: F401 (so that forked commands need not import them)
 from rlftsim.cli.main import main as rlftsim
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.tfrecord import write_records
-from rlftsim.verbs import convert, evaluate, score, submit, synthesize  # noqa: F401
+from rlftsim.verbs import (  # noqa: F401 (so that forked commands need not import them)
+    augment,
+    convert,
+    evaluate,
+    score,
+    simulate,
+    submit,
+    synthesize,
+)  # fmt: skip
 
 NUM_FILES = 6
 LIMIT_S = 400.0
@@ -149,9 +156,10 @@ def start_fork_server():
     """Start the server that workers are forked from, for all commands that this process forks."""
     forkserver.set_forkserver_preload(
         [
-            "rlftsim.cli.augment",
-            "rlftsim.cli.simulate",
-            *(f"rlftsim.verbs.{name}" for name in ("convert", "evaluate", "score", "submit", "synthesize")),
+            *(
+                f"rlftsim.verbs.{name}"
+                for name in ("augment", "convert", "evaluate", "score", "simulate", "submit", "synthesize")
+            ),
         ]
     )
     forkserver.ensure_running()

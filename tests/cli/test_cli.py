@@ -674,7 +674,7 @@ class GoalConditioned(ConstantVelocity):
 
 
 def test_a_goal_is_given_to_the_model_and_its_outcome_is_printed(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--scenario", SCENARIO, "--num-rollouts", "2"]
     goals = ["--goal", f"{TURNS}=-74.19,19.77", "--goal", "52=3.28,-4.49"]
     status, out, err = run(capsys, *arguments, "--out", tmp_path / "o", *goals, "--picture")
@@ -690,7 +690,7 @@ def test_a_goal_is_given_to_the_model_and_its_outcome_is_printed(tmp_path, capsy
 
 
 def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     run(capsys, "goals", "propose", "synthetic", "--scenario", SCENARIO, "--out", tmp_path / "g.json")
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--out", tmp_path / "o", "--num-rollouts", "1"]
     status, out, _ = run(capsys, *arguments, "--goals", tmp_path / "g.json")
@@ -739,7 +739,7 @@ def goals_file(path, *goals, alternatives=()):
 @pytest.fixture
 def simulated(tmp_path, capsys, monkeypatch):
     """Runs `simulate` with a model that drives to its goals; returns status, output and errors."""
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     common = ["simulate", "goal-seeker", "--data", "synthetic", "--num-rollouts", "2", "--out", tmp_path / "o"]
     return lambda *arguments: run(capsys, *common, *arguments)
 

@@ -21,8 +21,6 @@ OLD_COMMANDS = {
     "tokens": "rlftsim.cli.tokens:Tokens",
     "pretrain": "rlftsim.cli.train:Pretrain",
     "finetune": "rlftsim.cli.train:Finetune",
-    "augment": "rlftsim.cli.augment:Augment",
-    "simulate": "rlftsim.cli.simulate:Simulate",
     "experiment": "rlftsim.cli.experiment:RunExperiment",
 }
 """Module and class of each verb that is no function yet."""

@@ -90,17 +90,19 @@ def _parsed(name: str, words: list[str], command: Any, recipe: str | None = None
     # Imported late: most verbs do not need recipes.
     import tyro
 
-    from rlftsim.verbs.commands import Command
+    from rlftsim.verbs.commands import Command, dataclass_parser
 
-    verb, stored = command.parser() if isinstance(command, Command) else command, words
+    verb, stored = command, words
     has_settings = hasattr(verb, "sections")
     if has_settings:
         from rlftsim.cli.recipe_verb import with_settings
 
         verb, stored = with_settings(verb, words, recipe)
 
+    parser = command.parser() if isinstance(command, Command) else dataclass_parser(verb)
+
     def cli(arguments: list[str]) -> Any:
-        return tyro.cli(verb, args=arguments, prog=f"rlftsim {name}", config=(tyro.conf.OmitSubcommandPrefixes,))
+        return tyro.cli(parser, args=arguments, prog=f"rlftsim {name}", config=(tyro.conf.OmitSubcommandPrefixes,))
 
     if any(word in HELP for word in words):
         return cli(stored)
@@ -171,7 +173,7 @@ def _check_values(verb: Any, words: Sequence[str]) -> None:
         flag = f"--{name.replace('_', '-')}"
         if name in COUNTS and isinstance(value, int) and value < 1:
             raise ConfigError(f"{flag} must be at least 1, got {value}.")
-        if value == [] and flag in words:
+        if value in ([], ()) and flag in words:
             raise ConfigError(f"{flag} needs at least one value.")
         if isinstance(value, Path) and ADDRESS.match(str(value)):
             _explain_address(value, words)

@@ -4,7 +4,7 @@ import inspect
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
@@ -40,7 +40,7 @@ class Command:
     @property
     def printer(self) -> Callable[..., Any] | None:
         """The function that prints the result; None where the verb prints."""
-        return self.show and getattr(import_module(self.function.__module__), self.show)
+        return getattr(import_module(self.location.partition(":")[0]), self.show) if self.show else None
 
     def parser(self) -> Callable[..., "Call"]:
         """A function for tyro, which reads its signature; makes the call of a command line."""
@@ -108,7 +108,7 @@ class Argument:
         settings = self.settings
         if settings is None:
             annotation, default = to_flag_type(self.annotation), self.default
-            markers = (*markers, tyro.conf.arg(help=self.text))
+            markers = (*markers, *([tyro.conf.arg(help=self.text)] if self.text else []))
         else:
             annotation, default = Any, NO_DEFAULT
             markers = (*markers, tyro.conf.arg(constructor=settings_parser(settings)))
@@ -152,6 +152,25 @@ def settings_parser(settings: Any) -> Callable[..., Any]:
         for field in fields(settings)
     ]
     return with_parameters(kind, summary_of(kind), [argument.to_parameter() for argument in arguments])
+
+
+def dataclass_parser(verb: type[Any]) -> Callable[..., Any]:
+    """A function for tyro that makes a verb which is a dataclass still, its texts on one line each.
+
+    Args:
+        verb: Dataclass, or one made from it with further fields for the sections of a recipe.
+    """
+    hints, written = get_type_hints(verb, include_extras=True), [kind for kind in verb.__mro__ if is_dataclass(kind)]
+    texts = field_documentation(written[1] if hasattr(verb, "starting_name") else verb)
+    arguments = []
+    for entry in fields(verb):
+        default = entry.default if entry.default_factory is MISSING else entry.default_factory()
+        arguments.append(
+            Argument(
+                entry.name, hints[entry.name], NO_DEFAULT if default is MISSING else default, texts.get(entry.name, "")
+            )
+        )
+    return with_parameters(verb, describe(verb), [argument.to_parameter() for argument in arguments])
 
 
 def with_parameters(
@@ -201,12 +220,16 @@ COMMANDS = {
     "data pull": Command("rlftsim.verbs.data:pull", ("url", "folder")),
     "synthesize": Command("rlftsim.verbs.synthesize:synthesize", ("destination",), names=FOLDER),
     "recipe": Command("rlftsim.verbs.recipe:recipe", ("name",), show="print_recipe"),
+    "augment": Command("rlftsim.verbs.augment:augment", ("model",)),
     "model show": Command("rlftsim.verbs.model:show_model", ("model",)),
     "model average": Command("rlftsim.verbs.model:average_models", ("models",)),
     "model import": Command("rlftsim.verbs.model:import_model", ("checkpoint",), names={"format": "from"}),
     "model export": Command("rlftsim.verbs.model:export_model", ("model", "out"), names={"format": "to"}),
     "goals propose": Command("rlftsim.verbs.goals:propose_goals", ("data",)),
     "goals check": Command("rlftsim.verbs.goals:check_goals", ("file",)),
+    "simulate": Command(
+        "rlftsim.verbs.simulate:simulate", ("policy",), ("out",), {**MODEL, "scenarios": "data"}, "print_rollouts"
+    ),
     "drive": Command("rlftsim.verbs.drive:drive", ("planner",)),
     "studio": Command("rlftsim.verbs.studio:studio"),
     "score": Command("rlftsim.verbs.score:score", ("rollouts",), show="print_scores"),

@@ -88,24 +88,24 @@ def evaluate(
     # 2. The policy and its name.
     if isinstance(policy, str | os.PathLike):
         name = name or evaluation.evaluation_name(policy)
-        policy = load_policy_or_oracle(policy, device)
+        model = load_policy_or_oracle(policy, device)
     else:
-        policy = to_policy(policy)
-        name = name or f"{type(policy).__name__}-{fingerprint_policy(policy)[:8]}"
-    policy = with_guidance(policy, guidance_scale)
+        model = to_policy(policy)
+        name = name or f"{type(model).__name__}-{fingerprint_policy(model)[:8]}"
+    model = with_guidance(model, guidance_scale)
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)
     folder = None if out is None else validate_folder(out)
     if isinstance(data, str | os.PathLike):
-        return evaluation.evaluate(policy, dataset_folder(data), folder, config, name=name, runner=runner)
+        return evaluation.evaluate(model, dataset_folder(data), folder, config, name=name, runner=runner)
     scenarios = to_scenarios(data)
     if isinstance(scenarios, ScenarioDataset):
-        return evaluation.evaluate(policy, scenarios, folder, config, name=name, runner=runner)
+        return evaluation.evaluate(model, scenarios, folder, config, name=name, runner=runner)
     # The evaluation reads scenarios by name, in other processes too, so those of a list get a data set.
     with tempfile.TemporaryDirectory(prefix="rlftsim-") as temporary:
         write_dataset((scenarios[position] for position in range(len(scenarios))), f"{temporary}/scenarios")
         listed = ScenarioDataset(f"{temporary}/scenarios")
-        return evaluation.evaluate(policy, listed, folder, config, name=name, runner=runner)
+        return evaluation.evaluate(model, listed, folder, config, name=name, runner=runner)
 
 
 def print_evaluation(result: Evaluation, *, out: Path) -> None:

@@ -4,7 +4,7 @@ import json as json_text
 import os
 import sys
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Literal, overload
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.explain_page import explain_rollouts
@@ -29,7 +29,11 @@ from rlftsim.viewer.notebook import check_rollouts
 @overload
 def score(scenarios: Data, rollouts: Rollouts, metric: ScoreMetric = "2025") -> RealismResult: ...
 @overload
-def score(scenarios: Data, rollouts: File, metric: ScoreMetric = "2025", **options: Any) -> Evaluation: ...
+def score(
+    scenarios: Data, rollouts: File, metric: ScoreMetric = "2025", *, out: File | None = ..., name: str | None = ...,
+    explain: File | None = ..., missing_map: Literal["error", "skip"] = ...,
+    missing_scenario: Literal["error", "skip"] = ..., limit: int | None = ..., jobs: int | None = ..., work: Work = ...,
+) -> Evaluation: ...  # fmt: skip
 def score(
     scenarios: Data,
     rollouts: Simulated,
