@@ -75,7 +75,7 @@ def simulate_folder(
         SetAside, Unfinished: See `run_items`.
     """
     identity = simulation.describe(model)
-    rollouts = WholeFiles(out, "{}.npz".format, partial(_read_rollouts, simulation.num_rollouts))
+    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_read_rollouts, simulation.num_rollouts))
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
