@@ -18,7 +18,6 @@ import pytest
 import torch
 
 from rlftsim import __version__
-from rlftsim.cli.goals import Choice
 from rlftsim.cli.main import VERBS, main
 from rlftsim.cli.recipe_verb import with_settings
 from rlftsim.cli.train import Pretrain
@@ -31,6 +30,7 @@ from rlftsim.scenario.open import SYNTHETIC, open_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics
+from rlftsim.verbs.goals import Choice
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -245,13 +245,14 @@ WRONG = {
         "simulate constant_velocity --data synthetic --out {tmp}/whose",
         "rollouts.json: not JSON.*: name another --out",
     ),
+    "a flag of a forecast that was not asked for": ("doctor --nodes 4", "--nodes has no effect: add --plan evaluate"),
     "an unknown metric": (
         "evaluate oracle --data synthetic --out {tmp}/o --metric 1999",
         "Unknown metric '1999': known are 2025",
     ),
     "no rollouts": (
         "evaluate oracle --data synthetic --out {tmp}/o --num-rollouts 0",
-        "num_rollouts must be at least 1",
+        "--num-rollouts must be at least 1, got 0",
     ),
     "no rollouts to simulate": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --num-rollouts 0",
@@ -398,14 +399,14 @@ def test_what_stops_a_verb_is_one_line(error, expected, line, capsys, monkeypatc
     def stop(*_, **__):
         raise error
 
-    monkeypatch.setattr("rlftsim.cli.data.dataset_stats", stop)
+    monkeypatch.setattr("rlftsim.verbs.data.dataset_stats", stop)
     status, _, err = run(capsys, "data", "stats", "synthetic")
     assert (status, err.strip().count("\n")) == (expected, 0)
     assert err.strip().startswith(line)
 
 
 def test_a_bug_keeps_its_traceback(capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.data.dataset_stats", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("rlftsim.verbs.data.dataset_stats", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run(capsys, "data", "stats", "synthetic")
 
@@ -712,7 +713,7 @@ class GoalConditioned(ConstantVelocity):
 
 
 def test_a_goal_is_given_to_the_model_and_its_outcome_is_printed(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--scenario", SCENARIO, "--num-rollouts", "2"]
     goals = ["--goal", f"{TURNS}=-74.19,19.77", "--goal", "52=3.28,-4.49"]
     status, out, err = run(capsys, *arguments, "--out", tmp_path / "o", *goals, "--picture")
@@ -728,7 +729,7 @@ def test_a_goal_is_given_to_the_model_and_its_outcome_is_printed(tmp_path, capsy
 
 
 def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     run(capsys, "goals", "propose", "synthetic", "--scenario", SCENARIO, "--out", tmp_path / "g.json")
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--out", tmp_path / "o", "--num-rollouts", "1"]
     status, out, _ = run(capsys, *arguments, "--goals", tmp_path / "g.json")
@@ -738,7 +739,7 @@ def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monk
 
 
 def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.results.load_policy_or_oracle", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.evaluate.load_policy_or_oracle", lambda *_: GoalConditioned())
     arguments = [
         "evaluate",
         "goal-seeker",
@@ -777,7 +778,7 @@ def goals_file(path, *goals, alternatives=()):
 @pytest.fixture
 def simulated(tmp_path, capsys, monkeypatch):
     """Runs `simulate` with a model that drives to its goals; returns status, output and errors."""
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     common = ["simulate", "goal-seeker", "--data", "synthetic", "--num-rollouts", "2", "--out", tmp_path / "o"]
     return lambda *arguments: run(capsys, *common, *arguments)
 

@@ -460,7 +460,7 @@ def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
         with pytest.raises(DataError, match="drive both alike"):
             compare_drives(result, other)
     models = [replace(result, settings=replace(result.settings, model=model)) for model in ("none", "first", "second")]
-    titles = [str(format_drive_comparison(models[a], models[b], alpha=0.05).title) for a, b in ((0, 1), (1, 2))]
+    titles = [str(format_drive_comparison(compare_drives(models[a], models[b])).title) for a, b in ((0, 1), (1, 2))]
     assert ["models differ" in title for title in titles] == [False, True]
     with pytest.raises(DataError, match="no such result"):
         DriveResult.read(tmp_path / "none.parquet")

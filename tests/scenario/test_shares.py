@@ -13,8 +13,7 @@ from typing import get_type_hints
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim.cli.main import HAVE_SHARES, VERBS, main
-from rlftsim.cli.submit import Build
+from rlftsim.cli.main import HAVE_SHARES, OLD_COMMANDS, main
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.jobs import folder as folders
@@ -23,6 +22,7 @@ from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.verbs.commands import COMMANDS, read_arguments
 
 CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 
@@ -251,11 +251,13 @@ def test_a_share_takes_over_from_a_driver_that_was_stopped(tmp_path):
 
 
 def test_the_commands_that_join_takes_are_those_with_shares():
-    classes = {verb: getattr(importlib.import_module(module), name) for verb, (module, name) in VERBS.items()}
-    classes["submit build"] = Build
-    with_shares = {
-        verb for verb, cls in classes.items() if any(hint in (Machines, Work) for hint in get_type_hints(cls).values())
+    old = {name: place.split(":") for name, place in OLD_COMMANDS.items()}
+    annotations = {
+        name: get_type_hints(getattr(importlib.import_module(m), c)).values() for name, (m, c) in old.items()
     }
+    for name, command in COMMANDS.items():
+        annotations[name] = [argument.annotation for argument in read_arguments(command.function).values()]
+    with_shares = {name for name, kinds in annotations.items() if any(kind in (Machines, Work) for kind in kinds)}
     assert with_shares == set(HAVE_SHARES)
 
 

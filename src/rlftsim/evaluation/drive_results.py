@@ -1,7 +1,7 @@
 """Results of `rlftsim drive`: one row per scenario, for one planner in one kind of traffic, in one Parquet file."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.table import Table
 
-from rlftsim.errors import DataError, check_types
+from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
 from rlftsim.jobs.documents import parse_json
@@ -162,7 +162,31 @@ def is_drive_result(path: str | PathLike[str]) -> bool:
         return False
 
 
-def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tuple[PairedDifference, ...]:
+@dataclass(frozen=True, eq=False)
+class DriveComparison:
+    """Two results, scenario by scenario; `comparison["progress"]` is the difference of one score."""
+
+    a: DriveResult
+    b: DriveResult
+    differences: tuple[PairedDifference, ...]
+    """Of the scores that both have, b minus a."""
+
+    def __iter__(self) -> Iterator[PairedDifference]:
+        return iter(self.differences)
+
+    def __getitem__(self, column: str) -> PairedDifference:
+        """Difference of one score.
+
+        Raises:
+            ConfigError: There is no such score in both.
+        """
+        for difference in self.differences:
+            if difference.column == column:
+                return difference
+        raise ConfigError(f"both have no score {column!r}, only {', '.join(row.column for row in self.differences)}.")
+
+
+def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> DriveComparison:
     """Paired differences of the scores that both have, b minus a.
 
     Args:
@@ -188,7 +212,11 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tu
     if not rows_a:
         raise DataError(f"{a.name} and {b.name} have no scenario in common.")
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
-    return tuple(compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
+    return DriveComparison(
+        a,
+        b,
+        tuple(compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns),
+    )
 
 
 def format_drives(*results: DriveResult) -> Table:
@@ -208,14 +236,9 @@ def format_drives(*results: DriveResult) -> Table:
     return table
 
 
-def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> Table:
-    """One row per score: both means and the verdict.
-
-    Args:
-        a: the reference.
-        b: the other one.
-        alpha: probability of calling a difference that is none.
-    """
+def format_drive_comparison(comparison: DriveComparison) -> Table:
+    """One row per score: both means and the verdict."""
+    a, b = comparison.a, comparison.b
     models = {a.settings.model, b.settings.model} - {"none"}
     note = ", whose traffic models differ" if len(models) > 1 else ""
     table = Table(title=f"{b.name} against {a.name}{note}", title_justify="left")
@@ -223,7 +246,7 @@ def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> 
     for name in (a.name, b.name):
         table.add_column(name, justify="right")
     table.add_column("verdict")
-    for row in compare_drives(a, b, alpha=alpha):
+    for row in comparison:
         if row.column in SHOWN and row.count:
             label = f"{row.column} {ARROWS[find_direction(row.column)]}"
             table.add_row(label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", row.verdict)

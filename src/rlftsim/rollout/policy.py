@@ -59,7 +59,8 @@ class Sampling:
     """Temperature and truncation of the draws. RL samples with the defaults, so that the estimator is unbiased."""
 
     temperature: float = 1.0
-    """The density is raised to 1 / temperature; 0 takes the mode."""
+    """Below 1 likely decisions become likelier, as the density is raised to 1 / temperature; 0 always takes the most
+    likely one, of continuous actions the mean."""
     top_k: int | None = None
     """Keep only this many of the most likely decisions; None keeps all."""
 
