@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
-from rlftsim.recipes.settings import field_documentation, summary_of
+from rlftsim.recipes.settings import field_documentation, summarize_docstring
 
 NO_DEFAULT = inspect.Parameter.empty
 
@@ -151,7 +151,7 @@ def settings_parser(settings: Any) -> Callable[..., Any]:
         Argument(field.name, hints[field.name], getattr(settings, field.name), texts.get(field.name, ""))
         for field in fields(settings)
     ]
-    return with_parameters(kind, summary_of(kind), [argument.to_parameter() for argument in arguments])
+    return with_parameters(kind, summarize_docstring(kind), [argument.to_parameter() for argument in arguments])
 
 
 def dataclass_parser(verb: type[Any]) -> Callable[..., Any]:
