@@ -17,8 +17,8 @@ def damaged_text():
     return pa.Array.from_buffers(pa.string(), 1, pa.array([b"\xff\xfe"], pa.binary()).buffers())
 
 
-def write_arrow(path, table):
-    with pa.ipc.new_file(path, table.schema) as writer:
+def write_arrow(path, table, compression=None):
+    with pa.ipc.new_file(path, table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
         writer.write_table(table)
     return path
 
@@ -36,6 +36,30 @@ def test_a_column_twice_is_refused(tmp_path):
     table = pa.table([pa.array([1]), pa.array([2])], names=["a", "a"])
     with pytest.raises(DataError, match="two columns 'a'"):
         map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_compressed_shard_is_refused_before_it_fills_the_memory(compression, tmp_path):
+    table = pa.table({"a": [bytes(1 << 20)] * 16})
+    path, unused = write_arrow(tmp_path / "a.arrow", table, compression), pa.default_memory_pool().max_memory()
+    assert path.stat().st_size < 1 << 17
+    del table
+    with pytest.raises(DataError, match=r"is damaged \(it is compressed, .*\): convert again\.$"):
+        map_arrow(path, "convert again")
+    assert pa.default_memory_pool().max_memory() == unused
+
+
+def test_a_shard_is_mapped_and_its_batches_are_as_many_as_its_end_says(tmp_path):
+    batches = pa.table({"a": pa.chunked_array([[bytes(1 << 16)], [b"x", None], []], pa.binary()), "b": [1, 2, 3]})
+    before = pa.total_allocated_bytes()
+    table = map_arrow(write_arrow(tmp_path / "a.arrow", batches), "convert again")
+    assert table.equals(batches)
+    assert pa.total_allocated_bytes() - before < 1 << 12
+    data = (tmp_path / "a.arrow").read_bytes()
+    for size in (8, 200, len(data) // 2, len(data) - 20):
+        (tmp_path / "cut.arrow").write_bytes(data[:size])
+        with pytest.raises(DataError, match="is damaged"):
+            map_arrow(tmp_path / "cut.arrow", "convert again")
 
 
 def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ from rlftsim.evaluation.resumable import (
     check_same_work,
     check_scenarios_stay,
     finish_result,
-    read_stored,
+    read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.progress import log
@@ -183,7 +183,7 @@ def _read_and_refuse(
     config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
 ) -> DriveResult | None:
     """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
-    result = read_stored(path, DriveResult.read)
+    result = read_finished(path, DriveResult.read)
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
     if result is not None and choice:
         left_out = len({*result.scenario_ids} - {*ids})

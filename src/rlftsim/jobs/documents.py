@@ -25,6 +25,8 @@ LONGEST_INTEGER = 40
 """Digits of a whole number: the seeds of numpy have 39."""
 LONGEST_NAME = 40
 """Characters of a name that a message repeats."""
+MAX_NAME_BYTES = 200
+"""Bytes of a text that becomes a file name; file systems take names of 255 bytes, and a suffix follows."""
 _TYPE_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 
 

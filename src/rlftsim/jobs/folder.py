@@ -9,6 +9,7 @@ are not noticed.
 import errno
 import json
 import os
+import re
 import socket
 import time
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from types import TracebackType
 from typing import Any, Literal, TextIO
 
 from rlftsim.errors import ConfigError, DataError, NotYetError, in_short
-from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.documents import MAX_NAME_BYTES, read_json
 from rlftsim.jobs.files import errors_name, write_text
 from rlftsim.jobs.runner import Runner, Share, Unfinished, check_begun
 
@@ -46,6 +47,8 @@ SECONDS_TO_WAIT = 10.0
 """A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
 WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 """Errors of file systems that have no locks, such as Lustre mounted without `flock`."""
+_OWNER = re.compile(r"^\S+ process \d+ since \d{4}-", re.MULTILINE)
+"""Beginning of the line that `describe_owner` writes. Shares write into one file, so others may precede or follow."""
 
 
 def recognize_folder(folder: Path) -> FolderType | None:
@@ -99,10 +102,10 @@ def check_name(name: str, meaning: str) -> None:
         meaning: Meaning of the name at the beginning of the message, such as "an evaluation's name".
 
     Raises:
-        ConfigError: An empty name, more than 200 bytes, or a slash, a line break or another control character.
+        ConfigError: An empty name, more than `MAX_NAME_BYTES`, or a slash, a line break or another control character.
     """
     is_file_name = name.strip() and name not in (".", "..") and not {*"/\\"} & {*name}
-    if not (is_file_name and name.isprintable() and len(name.encode()) <= 200):
+    if not (is_file_name and name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES):
         raise ConfigError(f"{meaning} becomes a file name, {in_short(name)} cannot: choose another name.")
 
 
@@ -161,7 +164,7 @@ class Lease:
     Raises:
         NotYetError: Another driver holds the folder; says which, and since when.
         Unfinished: The work ended while a share waited for its turn, so nothing is left to do.
-        DataError: The folder cannot be written to.
+        DataError: The folder cannot be written to, or holds another file with the name of the lock.
     """
 
     def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
@@ -239,6 +242,7 @@ class Lease:
         Raises:
             NotYetError: Another process has a lock.
             Unfinished: Another process had a lock and has removed the file, at the end of all work.
+            DataError: The file is no lock.
         """
         with errors_name(path):
             if not must_exist:
@@ -246,7 +250,7 @@ class Lease:
             while True:
                 try:
                     # A file that was there and is gone must not come back: its work is done.
-                    file = open(path, "r+" if must_exist else "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                    file = open(path, "r+" if must_exist else "a+", encoding="utf-8", errors="replace")  # noqa: SIM115
                 except FileNotFoundError:
                     if not must_exist:
                         raise
@@ -275,15 +279,18 @@ class Lease:
                     break
                 file.close()
             self._files.append(file)
+            text = f"{self._note}\n{describe_owner()}"
+            # A full disk may have kept the beginning alone.
+            if not (text.startswith(stored := _read_lock(file)) or _OWNER.search(stored)):
+                raise DataError(f"{path} is no lock of `rlftsim`: rename it, or choose another folder.")
             file.truncate(0)
-            file.write(f"{self._note}\n{describe_owner()}")
+            file.write(text)
             file.flush()
 
     def _refusal(self, file: TextIO) -> str:
         """Message with the owner and age of a lock."""
-        file.seek(0)
         try:
-            owner, age = parse_owner(file.read())
+            owner, age = parse_owner(_read_lock(file))
             whom = f" ({owner}, for {age})"
         except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
             whom = ""
@@ -291,9 +298,18 @@ class Lease:
 
 
 def remove_locks(path: Path) -> None:
-    """Remove a lock file and those of its shares, where the work has ended; missing files are no error."""
+    """Remove a lock file and those of its shares, where the work has ended; missing and other files are no error."""
     for lock in (*path.parent.glob(f"{path.name}.*-of-*"), path):
-        lock.unlink(missing_ok=True)
+        with suppress(FileNotFoundError), lock.open(encoding="utf-8", errors="replace") as file:
+            stored = _read_lock(file)
+            if not stored or _OWNER.search(stored):
+                lock.unlink()
+
+
+def _read_lock(file: TextIO) -> str:
+    """Text of a lock file, and the beginning of any other."""
+    file.seek(0)
+    return file.read(1 << 20)
 
 
 def describe_owner() -> str:

@@ -5,15 +5,16 @@ It does not matter where an item is done, nor how often: the same item always wr
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
+from rlftsim.errors import DataError
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.processes import Advance, Task
-from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Runner, check_finished
+from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.runner import Runner, check_finished, select_items
 from rlftsim.jobs.threads import one_thread
 
 Item = TypeVar("Item")
@@ -43,20 +44,42 @@ class ResultFormat(ABC, Generic[Item, Stored]):
         return str(item)
 
 
+def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
+    """Contents of a file that holds a result; None for a missing file, or a damaged one, which a message names.
+
+    Args:
+        path: File of the result, which may be missing.
+        read: Reader of the file; raises a DataError for a damaged one.
+    """
+    if not path.exists():
+        return None
+    try:
+        return read(path)
+    except DataError as error:
+        log.warning(f"{path} has to be made again: {str(error).removeprefix(str(path)).lstrip(': ')}")
+        return None
+
+
 @dataclass(frozen=True, eq=False)
 class WholeFiles(ResultFormat[Item, Path]):
-    """A file for each item, which is there when it is whole; the file itself is the result."""
+    """A file for each item; the file itself is the result."""
 
     folder: Path
     name: Callable[[Item], str]
     """Name of an item's file, also in messages."""
+    contents: Callable[[Path], object]
+    """Reader of a file; raises a DataError for a damaged one."""
     units: Callable[[Item], int] | None = None
     """Units of progress that an item stands for; None = each item for a single unit."""
+    _whole: set[Path] = field(default_factory=set, init=False)
+    """Files that were read once, which is enough."""
 
     def read(self, item: Item) -> Path | None:
         """The file of an item, see `ResultFormat`."""
         path = self.folder / self.name(item)
-        return path if path.exists() else None
+        if path not in self._whole and read_stored(path, self.contents) is not None:
+            self._whole.add(path)
+        return path if path in self._whole else None
 
     def count_units(self, item: Item) -> int:
         """Value of `units`, see `ResultFormat`."""
@@ -152,7 +175,7 @@ def run_items(
         Unfinished: The runner is a share, which is done, while others are not.
         NotYetError: Results are missing that other processes should have made, or that vanished meanwhile.
     """
-    selected = runner.select(range(len(items)))
+    selected = select_items(runner, range(len(items)))
     pending = [number for number in selected if not format.is_finished(items[number])]
     total, num_pending = (sum(format.count_units(items[n]) for n in numbers) for numbers in (selected, pending))
     with progress_bar(title, total, total - num_pending, unit=unit, show=show_progress) as advance, one_thread():

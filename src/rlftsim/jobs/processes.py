@@ -134,10 +134,6 @@ class Processes:
     item_log: Path | None = None
     """See `log_item`."""
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """All items, see `Runner`."""
-        return items
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:

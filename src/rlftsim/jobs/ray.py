@@ -66,10 +66,6 @@ class RayRunner:
     on_death: OnDeath = "skip"
     item_log: Path | None = None
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """All items, see `Runner`."""
-        return items
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:

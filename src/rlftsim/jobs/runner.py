@@ -34,10 +34,6 @@ class Unfinished(RlftsimError):
 class Runner(Protocol):
     """Does independent items of work somewhere."""
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """The items that this runner does, of all items of the work; the others are another machine's."""
-        ...
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:
@@ -76,10 +72,6 @@ class Inline:
 
     item_log: Path | None = None
     """See `log_item`."""
-
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """All items, see `Runner`."""
-        return items
 
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
@@ -124,10 +116,6 @@ class Share:
     def __str__(self) -> str:
         return f"share {self.number}/{self.count}"
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """The items of this share, see `Runner`."""
-        return items[self.number - 1 :: self.count]
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:
@@ -139,9 +127,12 @@ class Share:
 class Joining(Inline):
     """No item: only puts together what shares have made (`rlftsim join`)."""
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """No items, see `Runner`."""
-        return items[:0]
+
+def select_items(runner: Runner, items: Sequence[Any]) -> Sequence[Any]:
+    """The items that a runner does, of all items of the work; the others are another machine's."""
+    if isinstance(runner, Share):
+        return items[runner.number - 1 :: runner.count]
+    return items[:0] if isinstance(runner, Joining) else items
 
 
 def choose_runner(jobs: int, num_items: int, on_death: OnDeath = "skip") -> Runner:

@@ -17,6 +17,7 @@ MAX_VALUES = 1 << 27
 """Values that a Parquet file may hold, however small it is: 1 GiB of numbers."""
 MAX_VALUES_PER_BYTE = 100
 """Values a byte of a larger Parquet file; columns that hardly vary are packed far better than others."""
+_ARROW_BEGINNING = b"ARROW1\0\0"
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, pa.ArrowException)
 
 
@@ -45,16 +46,27 @@ def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimE
 def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
     """Validated table of an Arrow file, memory-mapped: its values are read when they are needed.
 
+    Batches are read from the messages that were looked at, not from where the end of the file says that they are.
+
     Args:
         path: Arrow file of a shard, which must not change while the table is in use.
         remedy: Way out at the end of every message.
 
     Raises:
         FileNotFoundError: No such file; the caller knows what was looked for.
-        DataError: Damaged file, or text that is no UTF-8.
+        DataError: Damaged or compressed file, or text that is no UTF-8.
     """
     try:
-        return _validate_table(pa.ipc.open_file(pa.memory_map(fspath(path))).read_all())
+        file = pa.memory_map(fspath(path))
+        reader = pa.ipc.open_file(file)
+        file.seek(len(_ARROW_BEGINNING))
+        messages = [message for message in pa.ipc.MessageReader.open_stream(file) if message.type != "schema"]
+        if len(messages) != reader.num_record_batches:
+            raise ValueError(f"it has {len(messages)} batches, not {reader.num_record_batches}")
+        if any(map(_is_compressed, messages)):
+            raise ValueError("it is compressed, as this package writes no shard")
+        batches = [pa.ipc.read_record_batch(message, reader.schema) for message in messages]
+        return _validate_table(pa.Table.from_batches(batches, reader.schema))
     except FileNotFoundError:
         raise
     except _DAMAGE as problem:
@@ -98,6 +110,27 @@ def _validate_table(table: pa.Table) -> pa.Table:
     if repeated:
         raise ValueError(f"two columns {repeated[0][:40]!r}")
     return table
+
+
+def _is_compressed(message: pa.ipc.Message) -> bool:
+    """True for a record batch whose values would unfold in memory to a size that they tell themselves.
+
+    pyarrow does not say; `Message.header` and `RecordBatch.compression` are in Arrow's format/Message.fbs.
+    """
+    data = message.metadata.to_pybytes()
+
+    def read(start: int, size: int = 4) -> int:
+        return int.from_bytes(data[start : start + size], "little")
+
+    def find(table: int, number: int) -> int:
+        """Position of a table's field, 0 where it is left out: a FlatBuffer lists offsets before its tables."""
+        offsets = table - int.from_bytes(data[table : table + 4], "little", signed=True)
+        entry = 4 + 2 * number
+        offset = read(offsets + entry, 2) if entry < read(offsets, 2) else 0
+        return table + offset if offset else 0
+
+    header = find(read(0), 2)
+    return find(header + read(header), 3) > 0
 
 
 def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:

@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64
 
 from rlftsim.errors import DataError, in_short
+from rlftsim.jobs.documents import MAX_NAME_BYTES
 
-MAX_ID_BYTES = 200
-"""Of a scenario id; file systems take names of 255 bytes, and a suffix follows."""
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
@@ -233,11 +232,11 @@ class Scenario:
             DataError: it is no text or empty, too long, or has a slash or a control character.
         """
         name = self.scenario_id
-        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_ID_BYTES
+        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_NAME_BYTES
         if not is_text or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
             raise DataError(
                 f"scenario id {in_short(name)} is no file name, and files are named after it: write it as text of at "
-                f"most {MAX_ID_BYTES} bytes without slashes and control characters"
+                f"most {MAX_NAME_BYTES} bytes without slashes and control characters"
             )
 
     def check_array_shapes(self) -> None:
