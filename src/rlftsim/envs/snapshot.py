@@ -8,6 +8,7 @@ the episode again, which gives equal bits: the same network calls on the same nu
 import hashlib
 import json
 from dataclasses import asdict
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from safetensors.numpy import load, save
 from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, check_types, in_short
 from rlftsim.jobs.documents import parse_json
 from rlftsim.scenario.types import CURRENT_STEP
 
@@ -77,7 +78,11 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
     try:
         dice = [tuple(Dice(**values) for values in row) for row in about["dice"]]
-    except TypeError as error:
+        for draw in chain.from_iterable(dice):
+            check_types(draw)
+            if min(draw.seed, draw.rollout) < 0:
+                raise ConfigError(f"negative dice: {in_short([draw.seed, draw.rollout])}")
+    except (TypeError, ConfigError) as error:
         raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
     return episode, repeat(episode, start(episode, dice[0]), motion[1:], dice)
 

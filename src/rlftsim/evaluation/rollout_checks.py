@@ -76,6 +76,7 @@ class PoseChecks:
         if only_logged and scenario.has_future:
             self.is_judged = tracks.valid[rows, HISTORY_STEPS:TOTAL_STEPS]
 
+    @np.errstate(over="ignore")  # infinitely far is far
     def first_step_errors(self) -> Float32[np.ndarray, "N A"]:
         """Meters from each agent's first position to that of constant velocity, or to the current one if nearer."""
         first, now = self.poses[:, :, :2, 0], self.position[:, :2]
@@ -169,6 +170,7 @@ class _Largest:
         return _Largest(math.sqrt(self.value), self.rollout, self.agent)
 
 
+@np.errstate(over="ignore")
 def _square(dx: Float32[np.ndarray, "N A t"], dy: Float32[np.ndarray, "N A t"]) -> Float32[np.ndarray, "N A t"]:
     return dx * dx + dy * dy
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -19,6 +19,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
+
+from rlftsim.jobs.documents import printable
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200
@@ -42,10 +45,18 @@ if not log.handlers:
     log.propagate = False
 
 
+class _PlainConsole(Console):
+    """Console that shows a space in place of each control character of a text: names come from users' files."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text without control characters; lines stay lines."""
+        return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
+
+
 def print_wide(*tables: object) -> None:
     """Print tables as wide as they need to be, or as the terminal. Brackets in their texts are not markup."""
     width = None if Console().is_terminal else FILE_WIDTH
-    console = Console(width=width, markup=False, emoji=False)
+    console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
         console.print(table)
 

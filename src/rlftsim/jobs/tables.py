@@ -36,7 +36,8 @@ def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimE
     try:
         with pq.ParquetFile(path) as file:
             _check_size(file.metadata, stat(path).st_size)
-            return _validate_table(file.read())
+            # in batches: memory for as many values as a damaged column tells would be taken at once
+            return _validate_table(pa.Table.from_batches(file.iter_batches(), file.schema_arrow))
     except FileNotFoundError:
         raise
     except _DAMAGE as problem:
@@ -135,9 +136,9 @@ def _is_compressed(message: pa.ipc.Message) -> bool:
 
 def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:
     """Check that values can be in a file: a few bytes may announce as many as memory cannot hold."""
-    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    announced = sum(group.column(k).num_values for group in groups for k in range(group.num_columns))
-    announced = max(announced, metadata.num_rows * metadata.num_columns)
+    # not by the metadata of columns: a damaged one ends the process as soon as pyarrow looks at it
+    num_rows = sum(metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
+    announced = max(num_rows, metadata.num_rows) * metadata.num_columns
     if announced > max(MAX_VALUES, MAX_VALUES_PER_BYTE * num_bytes):
         raise ValueError(f"it announces {announced:.3g} values in {num_bytes} bytes")
 
