@@ -23,9 +23,10 @@ from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
 from rlftsim.training.data import share_cache
-from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios, find_method
+from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 from rlftsim.training.processes import linked_processes
+from rlftsim.training.registry import find_method
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
 from rlftsim.training.validation import ValidationConfig, check_validation, validate
 
