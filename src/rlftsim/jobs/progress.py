@@ -29,7 +29,7 @@ FILE_WIDTH = 200
 
 
 class _StandardError(logging.StreamHandler):  # type: ignore[type-arg]
-    """Handler that looks up standard error at each message, because tests and notebooks replace it."""
+    """Handler that looks up standard error at each message, because tests and notebooks replace standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
         # The stream of the moment: the one at import may be closed by now.
@@ -54,7 +54,7 @@ class _PlainConsole(Console):
 
 
 def print_wide(*tables: object) -> None:
-    """Print tables as wide as they need to be, or as the terminal. Brackets in their texts are not markup."""
+    """Print tables as wide as the terminal, or `FILE_WIDTH` wide in files. Brackets in texts are not markup."""
     width = None if Console().is_terminal else FILE_WIDTH
     console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
@@ -84,9 +84,9 @@ def progress_bar(
     Args:
         title: Name of the work, in front of the bar.
         total: Number of units in the whole work.
-        done: Number of units that an earlier run has finished; they do not count for the estimate of time.
+        done: Number of units that an earlier run has finished, which do not count for the estimate of time.
         unit: Unit of the numbers; bytes are shown as kB, MB or GB.
-        show: False prints nothing, neither a bar nor lines.
+        show: False prints neither a bar nor lines.
     """
     if not (show and sys.stderr.isatty()):
         yield _lines(title, total, done, show)
