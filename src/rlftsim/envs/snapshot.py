@@ -1,8 +1,7 @@
-"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format and a checksum, nothing that could run
-code.
+"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format and a checksum, no code.
 
-An episode follows from its scenarios, its dice and the planner's motion, so these are all that is stored. Reading runs
-the episode again, which gives equal bits: the same network calls on the same numbers.
+An episode follows from scenarios, dice and the planner's motion, so these are all that is stored. Reading runs the
+episode again, which gives equal bits: the same network calls on the same numbers.
 """
 
 import hashlib
@@ -59,8 +58,8 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         source: Source of the environment that continues the episode.
 
     Raises:
-        DataError: no snapshot, or a damaged one.
-        ConfigError: of another model, or of other settings.
+        DataError: no snapshot, or a damaged snapshot.
+        ConfigError: A snapshot of a different model, or of other settings.
     """
     if not isinstance(saved, bytes) or hashlib.sha256(saved[:-CHECKSUM_BYTES]).digest() != saved[-CHECKSUM_BYTES:]:
         raise DataError("not a snapshot of an episode, or a damaged one: take one with snapshot().")
@@ -91,7 +90,7 @@ def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
     """Description and motion [T + 1, M, 5] of a snapshot.
 
     Raises:
-        DataError: Something is missing, of another type or not finite.
+        DataError: A value is missing, of the wrong type or not finite.
     """
     try:
         arrays = load(body)
