@@ -39,7 +39,7 @@ def assign_drivers(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
     """Driver of each agent of a scenario, as numbers of `Driver`.
 
     Args:
-        scene: Scene with the simulated agents, a driver each.
+        scene: Scene whose simulated agents get a driver each.
         rules: Agents to driver, the first match wins; an agent that no rule names follows the policy.
 
     Raises:

@@ -141,7 +141,7 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
     Args:
         episode: Episode with the constant world, map and settings.
         state: State before the action; not changed.
-        action: Planner actions [M, *shape]; actions of agents at the end of an episode are ignored.
+        action: Planner actions [M, *shape]; actions of agents whose episode is over are ignored.
 
     Raises:
         ConfigError: no numbers, a NaN, a wrong shape, or an action that an agent cannot take.
@@ -215,7 +215,7 @@ def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
 
 
 def _with_ends(episode: Episode, state: EpisodeState) -> EpisodeState:
-    """The same state, with marks for the agents at the end of an episode."""
+    """The same state, with marks for the agents whose episode ends here."""
     is_over = state.world.step >= episode.config.max_steps
     return replace(state, ended=state.ended | _stopped(episode, state) | is_over)
 

@@ -1,9 +1,8 @@
 """Observations of planner-driven agents: arrays of fixed size, rows nearest first.
 
 M agents over B scenes; K neighbors, L pieces of lanes, E pieces of road edges, C crossings, T lights, R route points.
-Frame: the observing agent's own at the present step (x ahead, y left), or the map frame; meters, seconds, radians. Rows
-beyond the present things are zeros, and 0 in the mask. Things above or below the agent's road, as at a bridge, are left
-out.
+Frame: the observing agent's own at the present step (x ahead, y left), or the map frame; meters, seconds, radians.
+Unused rows are zeros, and 0 in the mask. Things above or below the agent's road, as at a bridge, are left out.
 """
 
 from dataclasses import dataclass, fields

@@ -103,8 +103,8 @@ class TrafficParallelEnv(ParallelEnv):
 
         Args:
             seed: Seed of the order of scenarios and of the traffic; equal seeds, equal episodes.
-            options: Choices "scenario", "rollout" and "goals", as of `EgoEnv`; further names are ignored, since
-                PettingZoo allows further names.
+            options: Choices "scenario", "rollout" and "goals", as of `EgoEnv`; further names are ignored, as PettingZoo
+                allows.
 
         Raises:
             ConfigError: an unknown scenario, or a scenario without a planner-driven agent.
@@ -128,7 +128,7 @@ class TrafficParallelEnv(ParallelEnv):
         return self._observe(self.agents), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
-        """Carry out an action of every agent that is left; agents at the end of an episode stand still.
+        """Carry out an action of every agent that is left; agents whose episode is over stand still.
 
         Args:
             actions: Agent name to planner action, for every name in `agents`.

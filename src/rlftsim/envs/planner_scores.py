@@ -196,10 +196,10 @@ def _progress_ratio(record: Record) -> float:
 
 
 def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.ndarray, "T1"], Bool[np.ndarray, "T1"]]:
-    """Angle of the lane that fits each step best to the agent's heading, speed limit, and True in a junction.
+    """Angle from the agent's heading to the best lane at each step, speed limit, and True in a junction.
 
-    NaN, 0 and False where there is no lane. Best is, among the lanes around the agent's center, the lane in the
-    direction of the agent.
+    NaN, 0 and False where there is no lane. Best is, among the lanes around the agent's center, the lane with the
+    smallest angle.
     """
     search = lane_search(record.scene.scenario)
     angle, limit = np.full(record.steps + 1, math.nan), np.zeros(record.steps + 1)

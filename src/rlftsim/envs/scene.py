@@ -199,7 +199,7 @@ def _cut_lanes(scenario: Scenario, graph: LaneGraph, lights: Lights) -> LaneSegm
 
 
 def _cut_edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, "e 4"], Float[np.ndarray, "e"]]:
-    """Segments of road edges, and heights."""
+    """Segments of road edges, with heights."""
     features, segments, heights = scenario.map_features, [np.zeros((0, 4))], [np.zeros(0)]
     for index in features.find_indices(ROAD_EDGE_TYPES):
         line = features.polyline(index).astype(np.float64) - [*scenario.origin, 0.0]
@@ -217,7 +217,7 @@ def _cut_edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, 
 
 
 def _build_crossings(scenario: Scenario) -> tuple[Float[np.ndarray, "c 8"], Float[np.ndarray, "c"]]:
-    """Rectangles parallel to the longest side of each polygon, and heights."""
+    """Rectangles parallel to the longest side of each polygon, with heights."""
     features, boxes, heights = scenario.map_features, [], []
     for index in features.find_indices(AREA_TYPES):
         polygon = features.polygon(index)

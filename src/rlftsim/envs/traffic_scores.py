@@ -86,8 +86,7 @@ def score_traffic(record: Record) -> TrafficScores:
 
 
 def blamed_others_rate(collisions: Sequence[Collision]) -> float:
-    """Fraction of contacts that are not the fault of the planner's agent, in one episode or several; NaN without
-    contacts."""
+    """Fraction of contacts without fault of the planner's agent, in one episode or several; NaN without contacts."""
     return sum(not collision.at_fault for collision in collisions) / len(collisions) if collisions else np.nan
 
 

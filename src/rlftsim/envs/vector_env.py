@@ -165,8 +165,8 @@ class EgoVectorEnv(VectorEnv):
             actions: Planner actions [num_envs, ...], in the units of the action space.
 
         Raises:
-            ConfigError: before `reset`, or an action with a NaN or of a wrong shape; with autoreset disabled an action
-                in a slot at the end of an episode.
+            ConfigError: before `reset`, or an action with a NaN or of a wrong shape; with autoreset disabled a slot
+                whose episode is over.
         """
         if not self._groups:
             raise ConfigError("these environments have no episodes yet: call reset() first.")

@@ -141,7 +141,7 @@ def build_world(
         context: Result of `policy.encode` for these scenarios; None = computed here.
 
     Raises:
-        ConfigError: a rule that does not fit, or agents that follow a missing policy.
+        ConfigError: a rule that does not fit, or agents that follow the policy where `policy` is left out.
     """
     scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
     batch = collate(scenarios)
@@ -305,8 +305,8 @@ def fork(world: World, state: WorldState, number: int, noise: Noise = "same") ->
         world: Scenes that step together, with the drivers of all agents.
         state: State where the branches begin; not changed.
         number: Number of branches to return.
-        noise: Dice of the branches: "same" = all meet the dice of `state`; "new" = branch i meets the dice of rollout +
-            1 + i, from the next decision on.
+        noise: Dice of the branches: "same" = all meet the dice of `state`; "new" = branch i meets the dice of
+            `rollout + 1 + i`, from the next decision on.
 
     Raises:
         ConfigError: Neither "same" nor "new".

@@ -1,4 +1,4 @@
-"""Planners by name. A package of your own names a planner as `package.module:Class` or adds an entry point:
+"""Planners by name, or as `package.module:Class`. A package of your own adds a name with an entry point:
 
 [project.entry-points."rlftsim.planners"]
 mine = "my_package:MyPlanner"
@@ -65,7 +65,7 @@ class CallablePlanner:
             setattr(self, name, value)
 
     def reset(self, info: dict[str, Any]) -> None:
-        """Leave all unchanged: a function has no memory."""
+        """Do nothing: a function has no memory."""
 
     def act(self, observation: dict[str, Any]) -> Any:
         """Result of the function."""
