@@ -1,4 +1,4 @@
-"""Training methods by name, and the method of settings; other packages register theirs as "rlftsim.methods"."""
+"""Training methods by name, and the method of settings; other packages register methods as "rlftsim.methods"."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ def method_by_name(name: str) -> Method[Any]:
 
 
 def find_method(settings: object) -> Method[Any] | None:
-    """The training method of settings, by their type; None where they are settings of no method."""
+    """The training method of settings, by type; None for settings of no method."""
     # Methods of other packages come last: a look at them imports all these packages.
     for list_names in (lambda: list(SHIPPED), METHODS.names):
         for name in list_names():
