@@ -68,7 +68,7 @@ class GoalConfig:
 
 
 def with_goals(config: GoalConfig) -> GoalConfig:
-    """The same settings, with goals for all agents and with hindsight where goals were off."""
+    """The same settings, with goals for all agents and hindsight, each where off so far."""
     return replace(config, probability=config.probability or 1.0, hindsight=config.hindsight or 1.0)
 
 
