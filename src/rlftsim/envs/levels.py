@@ -12,9 +12,10 @@ from scipy.spatial import KDTree
 
 from rlftsim.realism.map_based import HEIGHT_STRETCH
 
-CELL_M = 5.0
-LEVEL_M = 2.5
-"""Ground heights within a cell that differ by more than this are levels."""
+CELL_M = 3.5
+LEVEL_M = 1.5
+"""Ground heights within a cell that differ by more than the height of a car are levels. The diagonal of a cell rises by
+as much on slopes of 30 %, where boxes that touch may differ in height by more than half the sum of their heights."""
 STEP_UP_M = 1.5
 """Largest step of the ground that an agent follows; beyond it the agent keeps its height."""
 GRADE = 0.15
