@@ -1,4 +1,4 @@
-"""Positions, velocities and headings of logged tracks held against each other.
+"""Positions, heights, velocities and headings of logged tracks held against each other.
 
 They are redundant, so a log in another frame, unit or time base contradicts itself. A single track may, because its
 detections are noisy; a scenario does where more than half of its moving tracks do.
@@ -40,6 +40,7 @@ def describe_contradictions(tracks: Tracks) -> str:
         is_off = off_mps > np.maximum(SPEED_TOLERANCE_MPS, SPEED_TOLERANCE * faster)
         heading = tracks.heading[:, 1:]
         is_askew = dx * np.cos(heading) + dy * np.sin(heading) < LEAST_COSINE * moved_mps
+        climb_mps = np.abs(np.diff(tracks.position[..., 2])) / np.float32(STEP_S)
     has_front = np.isin(tracks.object_type, TYPES_WITH_FRONT)
     is_moving = seen & (2 * (seen & (faster > MOVING_MPS)).sum(1) > seen.sum(1))[:, None]
     is_driving = seen & (moved_mps > DRIVING_MPS) & has_front[:, None]
@@ -59,6 +60,14 @@ def describe_contradictions(tracks: Tracks) -> str:
         texts.append(
             f"headings contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
             f"{DRIVING_MPS:g} m/s: track {tracks.object_id[contrary[0]]} faces more than 45 degrees away from it"
+        )
+    contrary, num_judged = find_contrary(is_driving, climb_mps > moved_mps)
+    if 2 * len(contrary) > num_judged:
+        track = contrary[0]
+        texts.append(
+            f"heights contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
+            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[track]} climbs or falls at "
+            f"{float(np.median(climb_mps[track, is_driving[track]])):.1f} m/s, more than 45 degrees"
         )
     return "; ".join(texts)
 
