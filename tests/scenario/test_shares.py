@@ -13,7 +13,8 @@ from typing import get_type_hints
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim.cli.main import HAVE_SHARES, OLD_COMMANDS, main
+from rlftsim.cli.main import HAVE_SHARES, main
+from rlftsim.cli.parse import OLD_COMMANDS
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.jobs import folder as folders

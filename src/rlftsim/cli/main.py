@@ -17,13 +17,6 @@ from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 
-OLD_COMMANDS = {
-    "tokens": "rlftsim.cli.tokens:Tokens",
-    "pretrain": "rlftsim.cli.train:Pretrain",
-    "finetune": "rlftsim.cli.train:Finetune",
-    "experiment": "rlftsim.cli.experiment:RunExperiment",
-}
-"""Module and class of each verb that is no function yet."""
 VERBS = (
     "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "augment",
     "model", "goals", "simulate", "drive", "studio", "score", "evaluate", "compare", "submit", "experiment",

@@ -5,6 +5,7 @@ import io
 import os
 import re
 import shlex
+import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -12,12 +13,21 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from rlftsim.cli.main import OLD_COMMANDS
+import tyro
+
 from rlftsim.cli.mistakes import FLAG, explain, explain_action, flags_of
 from rlftsim.cli.stand_ins import stand_ins
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
+from rlftsim.verbs.commands import ACTIONS, COMMANDS, Command, dataclass_parser, describe
 
+OLD_COMMANDS = {
+    "tokens": "rlftsim.cli.tokens:Tokens",
+    "pretrain": "rlftsim.cli.train:Pretrain",
+    "finetune": "rlftsim.cli.train:Finetune",
+    "experiment": "rlftsim.cli.experiment:RunExperiment",
+}
+"""Module and class of each verb that is no function yet."""
 HELP = ("-h", "--help")
 COUNTS = (
     "jobs", "processes", "num_rollouts", "num_scenarios", "limit", "seeds", "top_k", "nodes", "cores", "measure"
@@ -57,9 +67,6 @@ def parse(words: Sequence[str]) -> Any:
 
 def _parse_verb(words: Sequence[str]) -> Any:
     """The verb, or its help, or one line of complaint."""
-    # Imported late: tyro takes time that the overview does not need.
-    from rlftsim.verbs.commands import COMMANDS
-
     names = {**COMMANDS, **OLD_COMMANDS}
     name = next((name for name in (" ".join(words[:2]), words[0]) if name in names), None)
     if name is None:
@@ -73,28 +80,23 @@ def _parse_verb(words: Sequence[str]) -> Any:
 
 def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
     """Print the actions of a verb, or say that one is missing or unknown."""
-    from rlftsim.verbs.commands import ACTIONS, COMMANDS, describe
-
     actions = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{verb} ")]
     if not any(word in HELP for word in words):
         raise ConfigError(explain_action(words, actions))
     print(f"usage: rlftsim {verb} [-h] {{{','.join(actions)}}}\n\n{ACTIONS[verb]}\n")
     for action in actions:
         summary, _, _ = describe(COMMANDS[f"{verb} {action}"].function).partition("\n")
-        print(textwrap.fill(summary, 100, initial_indent=f"  {action:9}", subsequent_indent=" " * 11))
+        width = shutil.get_terminal_size().columns
+        print(textwrap.fill(summary, width, initial_indent=f"  {action:9}", subsequent_indent=" " * 11))
     raise SystemExit(0)
 
 
 def _parsed(name: str, words: list[str], command: Any, recipe: str | None = None) -> Any:
     """The verb, or its help, or one line of complaint. Defaults are those of a recipe; None = guessed."""
-    # Imported late: most verbs do not need recipes.
-    import tyro
-
-    from rlftsim.verbs.commands import Command, dataclass_parser
-
     verb, stored = command, words
     has_settings = hasattr(verb, "sections")
     if has_settings:
+        # imported late: most verbs need no recipes
         from rlftsim.cli.recipe_verb import with_settings
 
         verb, stored = with_settings(verb, words, recipe)

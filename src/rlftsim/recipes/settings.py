@@ -1,13 +1,10 @@
 """Settings as text: a recipe printed with its documentation, and files of settings read back as flags."""
 
-import ast
 import difflib
-import inspect
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -15,6 +12,7 @@ from typing import Any, get_type_hints
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.documents import read_json
 from rlftsim.recipes.base import SECTIONS, Recipe, section_names
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
 
@@ -36,13 +34,8 @@ def list_sections(recipe: Recipe) -> dict[str, Any]:
     return {name: getattr(recipe, name) for name in section_names(recipe)}
 
 
-def summarize_docstring(documented: object) -> str:
-    """First sentence or line of a docstring."""
-    return (inspect.getdoc(documented) or "").partition("\n")[0]
-
-
 def _write_lines(section: Any, indent: str) -> Iterator[str]:
-    documentation = field_documentation(type(section))
+    documentation = read_field_texts(type(section))
     for field in fields(section):
         value = getattr(section, field.name)
         # A section without a docstring of its own is described by its class.
@@ -53,22 +46,6 @@ def _write_lines(section: Any, indent: str) -> Iterator[str]:
             yield from _write_lines(value, f"{indent}  ")
         else:
             yield f"{indent}{field.name}: {json.dumps(to_plain(value))}"
-
-
-def field_documentation(config: type) -> dict[str, str]:
-    """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
-    documentation: dict[str, str] = {}
-    for owner in reversed(config.__mro__):
-        if not is_dataclass(owner):
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
-        # A field's docstring is the string that follows it; at run time it is gone, so the source is read.
-        for statement, following in pairwise(body):
-            if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
-                continue
-            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
-                documentation[statement.target.id] = " ".join(str(following.value.value).split())
-    return documentation
 
 
 def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:

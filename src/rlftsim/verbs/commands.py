@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
-from rlftsim.recipes.settings import field_documentation, summarize_docstring
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 
 NO_DEFAULT = inspect.Parameter.empty
 
@@ -147,7 +147,7 @@ def settings_parser(settings: Any) -> Callable[..., Any]:
         settings: Dataclass; fields that are dataclasses become groups of flags.
     """
     kind = type(settings)
-    hints, texts = get_type_hints(kind, include_extras=True), field_documentation(kind)
+    hints, texts = get_type_hints(kind, include_extras=True), read_field_texts(kind)
     arguments = [
         Argument(field.name, hints[field.name], getattr(settings, field.name), texts.get(field.name, ""))
         for field in fields(settings)
@@ -162,7 +162,7 @@ def dataclass_parser(verb: type[Any]) -> Callable[..., Any]:
         verb: Dataclass, or one made from it with further fields for the sections of a recipe.
     """
     hints, written = get_type_hints(verb, include_extras=True), [kind for kind in verb.__mro__ if is_dataclass(kind)]
-    texts = field_documentation(written[1] if hasattr(verb, "starting_name") else verb)
+    texts = read_field_texts(written[1] if hasattr(verb, "starting_name") else verb)
     arguments = []
     for entry in fields(verb):
         default = entry.default if entry.default_factory is MISSING else entry.default_factory()
