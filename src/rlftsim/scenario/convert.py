@@ -344,7 +344,7 @@ def _convert_unit(
             on_error=task.on_error,
             report=skipped.append,
             advance=count,
-            tally=lambda tally: tallies.update({tally.what: tally.count}),
+            tally=lambda tally: tallies.update({tally.event: tally.count}),
         )
         for record, scenario in scenarios:
             writer.add(scenario, task.split, record)

@@ -21,23 +21,23 @@ LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
 _NUM_STEPS = round((sumo.SIMULATED_S - sumo.DISCARDED_S) / STEP_S)
 
 
-def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
-    """Draw a network, let SUMO fill it with traffic, and turn its output into bodies, lights and a map.
+def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> World:
+    """Draw a network, let SUMO fill it with traffic, and turn the output into bodies, lights and a map.
 
     Args:
-        kind: "city", "quiet" or "freeway".
-        seed: source of all choices; the same seed and version of SUMO give the same world.
-        folder: existing folder for SUMO's files.
+        network_type: Type of the network, "city", "quiet" or "freeway".
+        seed: Seed of all choices; the same seed and version of SUMO give the same world.
+        folder: Existing folder for SUMO's files; the caller deletes the files.
 
     Raises:
         ConfigError: SUMO or shapely is not installed.
-        RlftsimError: a program of SUMO failed.
+        RlftsimError: A program of SUMO failed.
     """
-    # One generator for all steps: their order is part of what a seed means.
+    # One generator for all steps: the order of steps is part of a seed's meaning.
     rng = np.random.default_rng(seed)
 
     # 1. Streets.
-    plan = draw_freeway_plan(rng) if kind == "freeway" else draw_city_plan(rng, quiet=kind == "quiet")
+    plan = draw_freeway_plan(rng) if network_type == "freeway" else draw_city_plan(rng, quiet=network_type == "quiet")
     layout = "opposites" if rng.random() < 0.75 else "incoming"
     network_file = sumo.compile_network(plan, folder, layout)
     network = read_network(network_file, plan)
@@ -60,7 +60,7 @@ def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
     bodies = read_vehicles(vehicles_file, network, types, rng)
     bodies += read_pedestrians(persons_file, rng)
     bodies += park_in_strips(rng, network, _NUM_STEPS)
-    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[kind])
+    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[network_type])
     return World(
         name="/".join(map(str, seed)),
         bodies=tuple(bodies),
