@@ -117,7 +117,7 @@ class Av2Source:
 
     def detects(self, path: str | os.PathLike[str]) -> bool:
         """True where at least 1 scenario has a map in the same folder."""
-        return any(_map_path(file).exists() for file in find_files(path))
+        return any(_find_map(file).exists() for file in find_files(path))
 
     def find(self, path: str | os.PathLike[str]) -> list[Unit]:
         """One unit for the scenarios of a folder whose ids begin with the same two characters.
@@ -130,11 +130,11 @@ class Av2Source:
         groups = defaultdict(list)
         for file in files:
             split = file.absolute().parent.parent.name
-            groups[(split, _scenario_id(file)[:2])].append(file)
+            groups[(split, _parse_id(file)[:2])].append(file)
         return [
             Unit(
                 f"{split}/{start}" if split in SPLITS else start,
-                tuple(path for file in group for path in (file, _map_path(file)) if path.exists()),
+                tuple(path for file in group for path in (file, _find_map(file)) if path.exists()),
                 SPLITS.get(split, "unknown"),
             )
             for (split, start), group in sorted(groups.items())
@@ -153,9 +153,9 @@ class Av2Source:
                             "tracks to predict not evaluated, as they leave the ground that the map covers", num_cut
                         )
             except DataError as error:
-                yield SkippedRecord(_scenario_id(file), record, str(error))
+                yield SkippedRecord(_parse_id(file), record, str(error))
                 record += 1
-            yield BytesRead(sum(path.stat().st_size for path in (file, _map_path(file)) if path.exists()))
+            yield BytesRead(sum(path.stat().st_size for path in (file, _find_map(file)) if path.exists()))
 
     def describe(self) -> dict[str, object]:
         """Guessed and missing values, and the settings."""
@@ -179,7 +179,7 @@ def find_files(path: str | os.PathLike[str]) -> list[Path]:
         for file in (match.rglob("scenario_*.parquet") if match.is_dir() else [match])
         if file.name.startswith("scenario_") and file.suffix == ".parquet"
     }
-    return sorted(files, key=lambda file: (_scenario_id(file), str(file)))
+    return sorted(files, key=lambda file: (_parse_id(file), str(file)))
 
 
 def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int]]:
@@ -197,9 +197,9 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
     """
     columns = _read_columns(file)
     num_steps = _count_steps(file, columns)
-    if not _map_path(file).exists():
-        raise DataError(f"{file.name}: there is no {_map_path(file).name} beside it")
-    map_features, ground = read_map(_map_path(file))
+    if not _find_map(file).exists():
+        raise DataError(f"{file.name}: there is no {_find_map(file).name} beside it")
+    map_features, ground = read_map(_find_map(file))
     windows = WINDOWS[source.window] if num_steps == RECORDED_STEPS else TEST_WINDOW
     recording, category, ego = _read_tracks(file, columns, num_steps, source, ground)
     for first, end in windows:
@@ -370,12 +370,12 @@ def _object_ids(file: Path, names: np.ndarray) -> np.ndarray:
     return ids
 
 
-def _scenario_id(file: Path) -> str:
+def _parse_id(file: Path) -> str:
     return file.stem.removeprefix("scenario_")
 
 
-def _map_path(file: Path) -> Path:
-    return file.with_name(f"log_map_archive_{_scenario_id(file)}.json")
+def _find_map(file: Path) -> Path:
+    return file.with_name(f"log_map_archive_{_parse_id(file)}.json")
 
 
 def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
