@@ -21,14 +21,7 @@ from rlftsim.scenario.dataset import (
     read_manifest,
 )
 from rlftsim.scenario.shards import ShardReader, hash_file
-from rlftsim.scenario.types import (
-    CURRENT_STEP,
-    LANE_TYPES,
-    ROAD_EDGE_TYPES,
-    STEP_S,
-    ObjectType,
-    Scenario,
-)
+from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, STEP_S, ObjectType, Scenario
 
 TELEPORT_SPEED_MPS = 60.0
 FAR_MAP_M = 200.0

@@ -21,10 +21,7 @@ def mirror_scenario(scenario: Scenario) -> Scenario:
     return replace(
         scenario,
         tracks=replace(
-            tracks,
-            position=tracks.position * _FLIP_Y,
-            heading=-tracks.heading,
-            velocity=tracks.velocity * _FLIP_Y[:2],
+            tracks, position=tracks.position * _FLIP_Y, heading=-tracks.heading, velocity=tracks.velocity * _FLIP_Y[:2]
         ),
         map_features=_mirror_map(scenario.map_features),
         lights=replace(lights, stop_point=lights.stop_point * _FLIP_Y),
@@ -47,9 +44,7 @@ def _mirror_map(features: MapFeatures) -> MapFeatures:
         points=flip(features.points),
         polygon_rest=None if residual is None else flip(residual),
         topology=replace(
-            topology,
-            neighbors=_swap_sides(topology.neighbors),
-            boundaries=_swap_sides(topology.boundaries),
+            topology, neighbors=_swap_sides(topology.neighbors), boundaries=_swap_sides(topology.boundaries)
         ),
     )
 
