@@ -253,12 +253,8 @@ def _topology(
 
     entries = [(lane.lane_id, link) for lane in lanes for link in lane.predecessors if link in centers]
     exits = [(lane.lane_id, link) for lane in lanes for link in lane.successors if link in centers]
-    return LaneTopology(
-        entry_lanes=np.array(entries, np.int64).reshape(-1, 2),
-        exit_lanes=np.array(exits, np.int64).reshape(-1, 2),
-        neighbors=np.array(neighbors, np.int64).reshape(-1, 7),
-        boundaries=np.array(boundaries, np.int64).reshape(-1, 6),
-        interpolating=interpolating,
+    return LaneTopology.of(
+        entry_lanes=entries, exit_lanes=exits, neighbors=neighbors, boundaries=boundaries, interpolating=interpolating
     )
 
 

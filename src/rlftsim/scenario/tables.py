@@ -34,6 +34,7 @@ from rlftsim.scenario.types import (
     LANE_TYPES,
     MEDIAN_SIZE_M,
     OTHER_SIZE_M,
+    POLYGON_TYPES,
     ROAD_EDGE_TYPES,
     STEP_S,
     TOTAL_STEPS,
@@ -59,7 +60,6 @@ WRONG_SIDE = 0.75
 """Road edges that have nearby lanes on their right along more than this fraction run the wrong way."""
 MAX_PREDICTED = 8
 SIZE_COLUMNS = ("length", "width", "height")
-POLYGON_TYPES = (MapFeatureType.CROSSWALK, MapFeatureType.SPEED_BUMP, MapFeatureType.DRIVEWAY)
 _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
 _WORDS, _NUMBERS, _INTEGERS = "text", "numbers", "whole numbers"
@@ -394,7 +394,7 @@ def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.nda
         return LaneTopology()
     index = {feature_id: k for k, (feature_id, feature_type, _) in enumerate(features) if feature_type in LANE_TYPES}
     last = {feature_id: len(points) - 1 for feature_id, _, points in features}
-    links: dict[str, list[tuple[int, ...]]] = {"entry": [], "exit": [], "neighbors": []}
+    links: dict[str, list[tuple[int, ...]]] = {"entry_lanes": [], "exit_lanes": [], "neighbors": []}
     speed_limit, interpolating = np.zeros(len(features), np.float32), np.zeros(len(features), bool)
     _check_repeated(rows, "lane_id")
     for row, lane in enumerate(rows["lane_id"].tolist()):
@@ -405,7 +405,7 @@ def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.nda
             for name in ("entry", "exit", "left", "right")
         }
         for name in ("entry", "exit"):
-            links[name] += [(lane, target) for target in targets[name]]
+            links[f"{name}_lanes"] += [(lane, target) for target in targets[name]]
         for side, name in enumerate(("left", "right")):
             links["neighbors"] += [(lane, side, target, 0, last[lane], 0, last[target]) for target in targets[name]]
         limit = rows["speed_limit_mph"][row] if "speed_limit_mph" in rows else np.nan  # NaN = unknown
@@ -413,13 +413,7 @@ def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.nda
             raise rows.error(row, f"speed_limit_mph is {limit:g}")
         speed_limit[index[lane]] = np.nan_to_num(limit)
         interpolating[index[lane]] = "interpolating" in rows and bool(rows["interpolating"][row])
-    return LaneTopology(
-        entry_lanes=np.array(links["entry"], np.int64).reshape(-1, 2),
-        exit_lanes=np.array(links["exit"], np.int64).reshape(-1, 2),
-        neighbors=np.array(links["neighbors"], np.int64).reshape(-1, 7),
-        speed_limit_mph=speed_limit,
-        interpolating=interpolating,
-    )
+    return LaneTopology.of(**links, speed_limit_mph=speed_limit, interpolating=interpolating)
 
 
 def _check_edge_directions(rows: _Rows, features: MapFeatures) -> None:

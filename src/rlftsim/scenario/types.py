@@ -80,6 +80,7 @@ class MapFeatureType(IntEnum):
 
 LANE_TYPES = (0, 1, 2, 3)
 ROAD_EDGE_TYPES = (14, 15, 16)
+POLYGON_TYPES = (MapFeatureType.CROSSWALK, MapFeatureType.SPEED_BUMP, MapFeatureType.DRIVEWAY)
 
 
 class LightState(IntEnum):
@@ -123,6 +124,12 @@ class Tracks:
         return replace(self, **{name: getattr(self, name)[:, steps] for name in names})
 
 
+def to_float32(values: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """Nearest float32. Values out of range become infinite without a warning, and are refused by a check later."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
 def _no_rows(columns: int) -> Int64[np.ndarray, "0 columns"]:
     return np.zeros((0, columns), np.int64)
 
@@ -146,6 +153,17 @@ class LaneTopology:
     interpolating: Bool[np.ndarray, "F"] | None = None
     """True = the lane joins two others inside a junction."""
 
+    @classmethod
+    def of(cls, **columns: Any) -> "LaneTopology":
+        """Links row by row.
+
+        Args:
+            columns: Fields by name; tables of links as lists of rows, without rows or left out where there are none.
+        """
+        tables = {name: table for name, table in vars(cls()).items() if table is not None and name in columns}
+        rows = {name: np.array(columns[name], np.int64).reshape(-1, table.shape[1]) for name, table in tables.items()}
+        return cls(**columns | rows)
+
 
 @dataclass(frozen=True, eq=False)
 class MapFeatures:
@@ -164,20 +182,34 @@ class MapFeatures:
     """
 
     @classmethod
-    def of(cls, features: Iterable[tuple[int, int, np.ndarray]], topology: LaneTopology | None = None) -> "MapFeatures":
+    def of(
+        cls,
+        features: Iterable[tuple[int, int, np.ndarray]],
+        topology: LaneTopology | None = None,
+        *,
+        has_polygon_rest: bool = False,
+    ) -> "MapFeatures":
         """Map of features one by one.
 
         Args:
             features: Feature id, `MapFeatureType` number and points [n, 3] of each, in the order of the map.
             topology: Links between the lanes; None = lanes without links.
+            has_polygon_rest: True keeps the rounding error of polygons.
         """
         ids, types, lines = zip(*features) if (features := list(features)) else ((), (), ())
+        lengths = np.array([len(line) for line in lines], np.int64)
+        exact = np.concatenate([np.zeros((0, 3)), *lines])  # [P, 3] float64
+        points, rest = to_float32(exact), np.zeros_like(exact)
+        # only of finite points: infinity minus infinity would warn before the point is refused by name
+        is_polygon = np.repeat(np.isin(types, POLYGON_TYPES), lengths)[:, None]
+        np.subtract(exact, points, out=rest, where=is_polygon & np.isfinite(points))
         return cls(
             feature_id=np.array(ids, np.int64),
             feature_type=np.array(types, np.int8),
-            points=np.concatenate([np.zeros((0, 3)), *lines]).astype(np.float32),
-            offsets=np.append(0, np.cumsum([len(line) for line in lines])).astype(np.int64),
+            points=points,
+            offsets=np.append(0, np.cumsum(lengths)),
             topology=topology or LaneTopology(),
+            polygon_rest=to_float32(rest) if has_polygon_rest else None,
         )
 
     def __len__(self) -> int:
@@ -215,8 +247,7 @@ class LightStates:
             rows: Step, lane id, `LightState` number, and x, y, z of the stop point in meters, world frame.
         """
         step, lane_id, state, *point = zip(*rows) if rows else ((),) * 6
-        with np.errstate(over="ignore"):  # a point outside of float32 becomes infinite, and is found by a check
-            stop_point = np.array(point, np.float64).T.reshape(-1, 3).astype(np.float32)
+        stop_point = to_float32(np.array(point, np.float64).T.reshape(-1, 3))
         return cls(np.array(step, np.int32), np.array(lane_id, np.int64), np.array(state, np.int8), stop_point)
 
 

@@ -28,6 +28,7 @@ from rlftsim.scenario.types import (
     MapFeatureType,
     Scenario,
     Tracks,
+    to_float32,
 )
 
 _TFRECORD_NAME = re.compile(r"\.tfrecords?(-\d+-of-\d+)?$")
@@ -36,7 +37,6 @@ _STATE_FIELDS = (
     *("center_x", "center_y", "center_z", "length", "width", "height"),
     *("heading", "velocity_x", "velocity_y", "valid"),
 )
-_POLYGONS = ("crosswalk", "speed_bump", "driveway")
 
 
 def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
@@ -209,7 +209,7 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
     rows = [read_state(state) for track in message.tracks for state in track.states]
     # float64 holds all fields exactly, `valid` as 0 or 1
     states = np.array(rows).reshape(len(message.tracks), num_steps, -1)  # [O, S, 10] float64
-    values = _to_float32(states)
+    values = to_float32(states)
     return Tracks(
         object_id=np.array([track.id for track in message.tracks], np.int64),
         object_type=np.array([track.object_type for track in message.tracks], np.int8),
@@ -219,12 +219,6 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
         size=np.ascontiguousarray(values[..., 3:6]),
         valid=states[..., 9] != 0,
     )
-
-
-def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Nearest float32. Values out of range become infinite without a warning and are refused later."""
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
 
 
 def _read_lights(dynamic_states: Sequence[womd_pb2.DynamicMapState]) -> LightStates:
@@ -243,25 +237,11 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     # a feature type that womd.proto does not have yet reads as a feature without data
     features = [feature for feature in features if feature.WhichOneof("feature_data")]
     members = [feature.WhichOneof("feature_data") for feature in features]
-    typed_points = [_read_points(feature, member) for feature, member in zip(features, members)]
-    flat = [value for _, points in typed_points for p in points for value in (p.x, p.y, p.z)]
-    offsets = np.zeros(len(features) + 1, np.int64)
-    np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
-    doubles = np.array(flat, np.float64).reshape(-1, 3)  # [P, 3]
-    points = _to_float32(doubles)
-    # The rounding error of polygons. Only of finite points: infinity minus infinity would warn before the point is
-    # refused by name.
-    is_polygon = np.repeat(np.array([member in _POLYGONS for member in members], bool), np.diff(offsets))  # [P]
-    rounding_error = np.zeros_like(doubles)
-    np.subtract(doubles, points, out=rounding_error, where=is_polygon[:, None] & np.isfinite(points))
-    return MapFeatures(
-        feature_id=np.array([feature.id for feature in features], np.int64),
-        feature_type=np.array([feature_type for feature_type, _ in typed_points], np.int8),
-        points=points,
-        offsets=offsets,
-        topology=_read_topology(features, members),
-        polygon_rest=_to_float32(rounding_error),
-    )
+    rows = []
+    for feature, member in zip(features, members):
+        feature_type, points = _read_points(feature, member)
+        rows.append((feature.id, feature_type, np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)))
+    return MapFeatures.of(rows, _read_topology(features, members), has_polygon_rest=True)
 
 
 def _read_points(feature: womd_pb2.MapFeature, member: str) -> tuple[int, Sequence[womd_pb2.MapPoint]]:
@@ -290,7 +270,7 @@ def _read_topology(features: Sequence[womd_pb2.MapFeature], members: Sequence[st
     is_lane = np.array([member == "lane" for member in members], bool)
     speed_limit = np.zeros(len(features), np.float32)
     interpolating = np.zeros(len(features), bool)
-    speed_limit[is_lane] = _to_float32(np.array([lane.speed_limit_mph for _, lane in lanes], np.float64))
+    speed_limit[is_lane] = to_float32(np.array([lane.speed_limit_mph for _, lane in lanes], np.float64))
     interpolating[is_lane] = [lane.interpolating for _, lane in lanes]
     neighbors, boundaries = [], []
     for lane_id, lane in lanes:
@@ -302,24 +282,13 @@ def _read_topology(features: Sequence[womd_pb2.MapFeature], members: Sequence[st
             for b in links:
                 span = (b.lane_start_index, b.lane_end_index)
                 boundaries.append((lane_id, side, b.boundary_feature_id, *span, b.boundary_type))
-    return LaneTopology(
-        entry_lanes=_rows(2, [(lane_id, link) for lane_id, lane in lanes for link in lane.entry_lanes]),
-        exit_lanes=_rows(2, [(lane_id, link) for lane_id, lane in lanes for link in lane.exit_lanes]),
-        neighbors=_rows(7, neighbors),
-        boundaries=_rows(6, boundaries),
-        stop_sign_lanes=_rows(
-            2,
-            [
-                (f.id, lane)
-                for f, member in zip(features, members)
-                if member == "stop_sign"
-                for lane in f.stop_sign.lane
-            ],
-        ),
+    signs = [feature for feature, member in zip(features, members) if member == "stop_sign"]
+    return LaneTopology.of(
+        entry_lanes=[(lane_id, link) for lane_id, lane in lanes for link in lane.entry_lanes],
+        exit_lanes=[(lane_id, link) for lane_id, lane in lanes for link in lane.exit_lanes],
+        neighbors=neighbors,
+        boundaries=boundaries,
+        stop_sign_lanes=[(sign.id, lane_id) for sign in signs for lane_id in sign.stop_sign.lane],
         speed_limit_mph=speed_limit,
         interpolating=interpolating,
     )
-
-
-def _rows(columns: int, rows: list[tuple[int, ...]]) -> np.ndarray:
-    return np.array(rows, np.int64).reshape(-1, columns)

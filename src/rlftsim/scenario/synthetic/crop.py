@@ -82,8 +82,7 @@ class MapCropper:
             for lane, side, neighbor in network_map.neighbors
             if lane in lengths and neighbor in lengths
         ]
-        feature_ids = [feature_id for feature_id, _, _ in stretches]
-        present = set(feature_ids)
+        present = {feature_id for feature_id, _, _ in stretches}
         signs = [(sign, lane) for sign, lane in network_map.stop_sign_lanes if sign in present and lane in lengths]
         # 4. Arrays of the stretches, F in all with P points.
         features = [feature for _, feature, _ in stretches]
@@ -91,24 +90,21 @@ class MapCropper:
         height = on_grid(self.ground.height_at(points), HEIGHT_GRID_PER_M)  # [P]
         is_lane = np.array([feature.feature_type in LANE_TYPES for feature in features])
         speed = np.array([feature.speed_mps for feature in features]) * MPH_PER_MPS * is_lane
-        return MapFeatures(
-            feature_id=np.array(feature_ids, np.int64),
-            feature_type=np.array([feature.feature_type for feature in features], np.int8),
-            points=np.concatenate([on_grid(points, MAP_GRID_PER_M), height[:, None]], axis=1),
-            offsets=np.append(0, np.cumsum([len(polyline) for _, _, polyline in stretches])).astype(np.int64),
-            topology=LaneTopology(
-                entry_lanes=_rows([(second, first) for first, second in links], 2),
-                exit_lanes=_rows(links, 2),
-                neighbors=_rows(neighbors, 7),
-                stop_sign_lanes=_rows(signs, 2),
-                speed_limit_mph=on_grid(np.rint(speed / 5.0) * 5.0, 1),
-                interpolating=np.array([feature.interpolating for feature in features], bool),
-            ),
+        topology = LaneTopology.of(
+            entry_lanes=sorted((second, first) for first, second in links),
+            exit_lanes=sorted(links),
+            neighbors=sorted(neighbors),
+            stop_sign_lanes=sorted(signs),
+            speed_limit_mph=on_grid(np.rint(speed / 5.0) * 5.0, 1),
+            interpolating=np.array([feature.interpolating for feature in features], bool),
         )
-
-
-def _rows(rows: list[tuple[int, ...]], columns: int) -> np.ndarray:
-    return np.array(sorted(rows), np.int64).reshape(-1, columns)
+        grid_points = np.column_stack([on_grid(points, MAP_GRID_PER_M), height])
+        ends_of_stretches = np.cumsum([len(polyline) for _, _, polyline in stretches])
+        lines = np.split(grid_points, ends_of_stretches)
+        return MapFeatures.of(
+            [(feature_id, feature.feature_type, line) for (feature_id, feature, _), line in zip(stretches, lines)],
+            topology,
+        )
 
 
 def cut_feature(feature: Feature, inside: Bool[np.ndarray, "n"]) -> list[Float[np.ndarray, "m 2"]]:
