@@ -10,17 +10,17 @@ signs and speed limits are missing in the data and in the scenarios.
 import glob
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import pyarrow as pa
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
+from rlftsim.scenario.rows import INTEGERS, NOTES, NUMBERS, TRUTHS, WORDS, Rows, read_rows
 from rlftsim.scenario.source import BytesRead, Item, Tally, Unit
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
@@ -69,20 +69,14 @@ SIZES_M = {
 """Length, width and height where no file of sizes is given; the ego has the size of the recording vehicles."""
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 FOCAL, SCORED = 3, 2
-_COLUMNS = {
-    **dict.fromkeys(("track_id", "object_type", "scenario_id", "focal_track_id", "city", "slice_id"), str),
-    **dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), float),
-    **dict.fromkeys(("start_timestamp", "end_timestamp"), float),
-    **dict.fromkeys(("object_category", "timestep", "num_timestamps", "map_id"), int),
-    "observed": bool,
-}
-_NEEDED = [name for name in _COLUMNS if name not in ("city", "slice_id", "map_id", "focal_track_id")]
-_TYPE_CHECKS: Mapping[type, tuple[Callable[[pa.DataType], bool], ...]] = {
-    str: (pa.types.is_string, pa.types.is_large_string, pa.types.is_null),
-    float: (pa.types.is_floating, pa.types.is_integer),
-    int: (pa.types.is_integer,),
-    bool: (pa.types.is_boolean,),
-}
+_NEEDED = (
+    dict.fromkeys(("track_id", "object_type", "scenario_id"), WORDS)
+    | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), NUMBERS)
+    | dict.fromkeys(("start_timestamp", "end_timestamp"), NUMBERS)
+    | dict.fromkeys(("object_category", "timestep", "num_timestamps"), INTEGERS)
+    | {"observed": TRUTHS}
+)
+_OPTIONAL = dict.fromkeys(("city", "slice_id", "focal_track_id"), NOTES) | {"map_id": NUMBERS}
 
 
 class Av2Source:
@@ -195,16 +189,16 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
     Raises:
         DataError: A file is missing or damaged, not of the published schema, or has impossible values.
     """
-    columns = _read_columns(file)
-    num_steps = _count_steps(file, columns)
+    rows = _read_rows(file)
+    num_steps = _count_steps(rows)
     if not _find_map(file).exists():
         raise DataError(f"{file.name}: there is no {_find_map(file).name} beside it")
     map_features, ground = read_map(_find_map(file))
     windows = WINDOWS[source.window] if num_steps == RECORDED_STEPS else TEST_WINDOW
-    recording, category, ego = _read_tracks(file, columns, num_steps, source, ground)
+    recording, category, ego = _read_tracks(rows, num_steps, source, ground)
     for first, end in windows:
         suffix = f"-{first}" if len(windows) > 1 else ""
-        scenario_id = f"{columns['scenario_id'][0]}{suffix}"
+        scenario_id = f"{rows['scenario_id'][0]}{suffix}"
         yield _cut_window(scenario_id, recording, category, ego, slice(first, end), map_features, ground)
 
 
@@ -246,107 +240,84 @@ def _cut_window(
     return scenario, num_cut
 
 
-def _read_columns(file: Path) -> dict[str, np.ndarray]:
-    """Columns of a Parquet file, all of the published schema and types."""
+def _read_rows(file: Path) -> Rows:
+    """Rows of a Parquet file of the published schema."""
     try:
         table = read_parquet(file, "get the file again")
     except FileNotFoundError:
         raise DataError(f"{file.name} is missing: get the file again") from None
-    names = [name for name in table.schema.names if not name.startswith("__index_level_")]
-    extra = [name for name in names if name not in _COLUMNS]
-    missing = [name for name in _NEEDED if name not in names]
-    if extra or missing:
-        cause = f"the unknown column {extra[0]}" if extra else f"no column {missing[0]}"
-        raise DataError(f"{file.name} has {cause}: its schema is not the published one")
-    if not table.num_rows:
+    try:
+        for name in table.schema.names:
+            if name not in _NEEDED | _OPTIONAL and not name.startswith("__index_level_"):
+                raise DataError(f"{file.name} has the unknown column {name}")
+        rows = read_rows(file.name, table, _NEEDED, _OPTIONAL)
+    except DataError as error:
+        raise DataError(f"{error}: its schema is not the published one") from None
+    if not len(rows):
         raise DataError(f"{file.name} has no rows")
-    columns = {}
-    for name in names:
-        column = table[name]
-        if not any(check(column.type) for check in _TYPE_CHECKS[_COLUMNS[name]]):
-            raise DataError(f"{file.name}: column {name} is {column.type}: its schema is not the published one")
-        if column.null_count and name in _NEEDED:
-            raise DataError(f"{file.name}: column {name} has empty values")
-        columns[name] = column.to_numpy()
-    return columns
+    return rows
 
 
-def _count_steps(file: Path, columns: Mapping[str, np.ndarray]) -> int:
+def _count_steps(rows: Rows) -> int:
     """Number of recorded steps, 110, or 50 where the future is withheld."""
     for name in ("scenario_id", "num_timestamps", "start_timestamp", "end_timestamp"):
-        if (columns[name] != columns[name][0]).any():
-            raise DataError(f"{file.name}: {name} must be the same in all rows")
-    announced = int(columns["num_timestamps"][0])
-    step = columns["timestep"]
+        if (rows[name] != rows[name][0]).any():
+            raise DataError(f"{rows.table}: {name} must be the same in all rows")
+    announced = int(rows["num_timestamps"][0])
+    step = rows["timestep"]
     num_steps = int(step.max()) + 1
     allowed = (RECORDED_STEPS, OBSERVED_STEPS)
     if announced not in allowed or num_steps not in allowed or num_steps > announced:
         num_rejected = announced if announced not in allowed else num_steps
         allowed_text = f"{RECORDED_STEPS} ({OBSERVED_STEPS} in the test split)"
-        raise DataError(f"{file.name} has {num_rejected} steps instead of {allowed_text}")
-    if step.min() < 0:
-        raise DataError(f"{file.name}: row {int(step.argmin())} has the timestep {int(step.min())}")
-    rows = np.flatnonzero(columns["observed"] != (step < OBSERVED_STEPS))
-    if len(rows):
-        raise DataError(f"{file.name}: row {rows[0]} contradicts itself: timestep {step[rows[0]]}, observed "
-                        f"{columns['observed'][rows[0]]}")  # fmt: skip
+        raise DataError(f"{rows.table} has {num_rejected} steps instead of {allowed_text}")
+    rows.check(step < 0, "timestep is {}", step)
+    is_contrary = rows["observed"] != (step < OBSERVED_STEPS)
+    rows.check(is_contrary, "the row contradicts itself: timestep {}, observed {}", step, rows["observed"])
     # the grid is exactly 0.1 s, so the ends must be as far apart as the number of steps says
-    seconds, expected = (columns["end_timestamp"][0] - columns["start_timestamp"][0]) / 1e9, (announced - 1) * STEP_S
+    seconds, expected = (rows["end_timestamp"][0] - rows["start_timestamp"][0]) / 1e9, (announced - 1) * STEP_S
     if not abs(seconds / expected - 1) <= 0.01:
-        raise DataError(f"{file.name}: {announced} steps last {seconds:.3f} s instead of {expected:.1f} s")
+        raise DataError(f"{rows.table}: {announced} steps last {seconds:.3f} s instead of {expected:.1f} s")
     return num_steps
 
 
-def _read_tracks(
-    file: Path, columns: Mapping[str, np.ndarray], num_steps: int, source: Av2Source, ground: Ground
-) -> tuple[Tracks, np.ndarray, int]:
+def _read_tracks(rows: Rows, num_steps: int, source: Av2Source, ground: Ground) -> tuple[Tracks, np.ndarray, int]:
     """Tracks of all steps in the order of the file, the categories, and the index of the ego."""
-    names, first_row, owner = np.unique(columns["track_id"].astype(str), return_index=True, return_inverse=True)
+    names, first_row, owner = np.unique(rows["track_id"].astype(str), return_index=True, return_inverse=True)
     order = np.argsort(first_row)  # file order
     names, first_row, owner = names[order], first_row[order], np.argsort(order)[owner]
-    step = columns["timestep"].astype(np.int64)
+    step = rows["timestep"]
     for name in ("object_type", "object_category"):
-        rows = np.flatnonzero(columns[name] != columns[name][first_row][owner])
-        if len(rows):
-            raise DataError(f"{file.name}: row {rows[0]}: track {names[owner[rows[0]]]} has a second {name}")
+        rows.check(rows[name] != rows[name][first_row][owner], f"track {{}} has a second {name}", names[owner])
     cells, counts = np.unique(owner * num_steps + step, return_counts=True)
     if (counts > 1).any():
         track, timestep = divmod(int(cells[counts > 1][0]), num_steps)
-        raise DataError(f"{file.name}: track {names[track]} has two rows for timestep {timestep}")
+        raise DataError(f"{rows.table}: track {names[track]} has two rows for timestep {timestep}")
     motion_columns = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
-    motion = np.column_stack([columns[name].astype(np.float64) for name in motion_columns])  # [rows, 5]
-    rows = np.flatnonzero(~(np.abs(motion) < 1e7).all(1))  # NaN is not, either
-    if len(rows):
-        raise DataError(
-            f"{file.name}: row {rows[0]}: track {names[owner[rows[0]]]} has a NaN, infinite or impossible value at "
-            f"timestep {step[rows[0]]}"
-        )
-    labels = columns["object_type"][first_row]
+    motion = np.column_stack([rows[name] for name in motion_columns])  # [rows, 5]
+    is_impossible = ~(np.abs(motion) < 1e7).all(1)  # NaN, too
+    cause = "track {} has a NaN, infinite or impossible value at timestep {}"
+    rows.check(is_impossible, cause, names[owner], step)
+    labels = rows["object_type"][first_row]
     unknown_labels = [label for label in labels if label not in OBJECT_TYPES and label not in UNUSED_OBJECT_TYPES]
     if unknown_labels:
-        raise DataError(f"{file.name}: unknown object_type {unknown_labels[0]!r}")
+        raise DataError(f"{rows.table}: unknown object_type {unknown_labels[0]!r}")
     if "AV" not in names:
-        raise DataError(f"{file.name} has no ego: no track AV")
+        raise DataError(f"{rows.table} has no ego: no track AV")
 
     # states [O, S]; zeros where a track is not seen
     shape = (len(names), num_steps)
     states, valid = np.zeros((*shape, 5)), np.zeros(shape, bool)
     states[owner, step], valid[owner, step] = motion, True
-    size = np.array(
-        [
-            source.sizes[EGO if name == "AV" else label if label in OBJECT_TYPES else UNNAMED]
-            for name, label in zip(names, labels)
-        ]
-    )  # [O, 3]
+    size_names = np.where(names == "AV", EGO, [label if label in OBJECT_TYPES else UNNAMED for label in labels])
+    size = np.array([source.sizes[name] for name in size_names])  # [O, 3]
     z = np.zeros(shape)
     z[valid] = ground.heights.at(states[valid][:, :2])
     z += size[:, 2:] / 2  # centers of boxes that stand on the ground
     position = np.concatenate([states[..., :2], z[..., None]], -1) * valid[..., None]
-    is_used = np.array(
-        [source.keep_other or label in OBJECT_TYPES or name == "AV" for name, label in zip(names, labels)]
-    )
+    is_used = source.keep_other | (size_names != UNNAMED)
     tracks = Tracks(
-        object_id=_object_ids(file, names),
+        object_id=_object_ids(rows.table, names),
         object_type=np.array([OBJECT_TYPES.get(label, ObjectType.OTHER) for label in labels], np.int8),
         position=position.astype(np.float32),
         heading=states[..., 2].astype(np.float32),
@@ -354,19 +325,19 @@ def _read_tracks(
         size=np.where(valid[..., None], size[:, None], 0.0).astype(np.float32),
         valid=valid,
     )
-    category = columns["object_category"][first_row][is_used]
+    category = rows["object_category"][first_row][is_used]
     return tracks.select(is_used), category, int(np.flatnonzero(names[is_used] == "AV")[0])
 
 
-def _object_ids(file: Path, names: np.ndarray) -> np.ndarray:
+def _object_ids(table: str, names: np.ndarray) -> np.ndarray:
     """Track ids as numbers; the ego's is 0, or above the highest id where 0 is taken."""
     invalid = [name for name in names if name != "AV" and not (name.isdecimal() and len(name) < 19)]
     if invalid:
-        raise DataError(f"{file.name}: track id {str(invalid[0])!r} is no number")
+        raise DataError(f"{table}: track id {str(invalid[0])!r} is no number")
     ids = np.array([-1 if name == "AV" else int(name) for name in names], np.int64)
     ids[ids == -1] = ids.max() + 1 if (ids == 0).any() else 0
     if len(np.unique(ids)) < len(ids):
-        raise DataError(f"{file.name}: two track ids are the same number")
+        raise DataError(f"{table}: two track ids are the same number")
     return ids
 
 

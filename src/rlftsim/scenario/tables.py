@@ -11,13 +11,11 @@ A scenario that breaks the contract is left out with the table, the row and the 
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
@@ -26,6 +24,18 @@ from rlftsim.geometry import wrapped
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.polylines import Heights, densify, find_runs
+from rlftsim.scenario.rows import (
+    INTEGERS,
+    LISTS,
+    NAMES_OR_NUMBERS,
+    NOTES,
+    NUMBERS,
+    TRUTHS,
+    WORD_LISTS,
+    WORDS,
+    Rows,
+    read_rows,
+)
 from rlftsim.scenario.source import BytesRead, Item, Unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
@@ -62,69 +72,32 @@ MAX_PREDICTED = 8
 SIZE_COLUMNS = ("length", "width", "height")
 _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
-_WORDS, _NUMBERS, _INTEGERS = "text", "numbers", "whole numbers"
-_EITHER, _TRUTH = "names or whole numbers", "True or False"
-_LISTS, _WORD_LISTS = "lists of whole numbers", "lists of words"
 _SCHEMAS: Mapping[str, tuple[dict[str, str], dict[str, str]]] = {
     TRACKS: (
-        {"scenario_id": _WORDS, "object_id": _INTEGERS, "type": _EITHER, "step": _INTEGERS}
-        | dict.fromkeys(("x", "y", "heading", "vx", "vy"), _NUMBERS),
-        dict.fromkeys(("z", *SIZE_COLUMNS), _NUMBERS),
+        {"scenario_id": WORDS, "object_id": INTEGERS, "type": NAMES_OR_NUMBERS, "step": INTEGERS}
+        | dict.fromkeys(("x", "y", "heading", "vx", "vy"), NUMBERS),
+        dict.fromkeys(("z", *SIZE_COLUMNS), NUMBERS),
     ),
     MAP: (
-        {"feature_id": _INTEGERS, "type": _EITHER, "x": _NUMBERS, "y": _NUMBERS},
-        {"scenario_id": _WORDS, "map_id": _WORDS, "z": _NUMBERS},
+        {"feature_id": INTEGERS, "type": NAMES_OR_NUMBERS, "x": NUMBERS, "y": NUMBERS},
+        {"scenario_id": WORDS, "map_id": WORDS, "z": NUMBERS},
     ),
     SCENARIOS: (
-        {"scenario_id": _WORDS, "ego_id": _INTEGERS},
-        {"map_id": _WORDS, "license": _WORDS, "step_s": _NUMBERS, "first_step": _INTEGERS}
-        | {"predict": _LISTS, "interest": _LISTS, "guessed": _WORD_LISTS},
+        {"scenario_id": WORDS, "ego_id": INTEGERS},
+        {"map_id": WORDS, "license": NOTES, "step_s": NUMBERS, "first_step": INTEGERS}
+        | {"predict": LISTS, "interest": LISTS, "guessed": WORD_LISTS},
     ),
     LANES: (
-        {"lane_id": _INTEGERS},
-        {"scenario_id": _WORDS, "map_id": _WORDS, "speed_limit_mph": _NUMBERS, "interpolating": _TRUTH}
-        | dict.fromkeys(("entry", "exit", "left", "right"), _LISTS),
+        {"lane_id": INTEGERS},
+        {"scenario_id": WORDS, "map_id": WORDS, "speed_limit_mph": NUMBERS, "interpolating": TRUTHS}
+        | dict.fromkeys(("entry", "exit", "left", "right"), LISTS),
     ),
     LIGHTS: (
-        {"scenario_id": _WORDS, "step": _INTEGERS, "lane_id": _INTEGERS, "state": _EITHER},
-        dict.fromkeys(("x", "y", "z"), _NUMBERS),
+        {"scenario_id": WORDS, "step": INTEGERS, "lane_id": INTEGERS, "state": NAMES_OR_NUMBERS},
+        dict.fromkeys(("x", "y", "z"), NUMBERS),
     ),
 }
 """Columns of each table that are needed, and columns that may be left out. Further columns are ignored."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Columns of some rows of a table, with the numbers of the rows."""
-
-    table: str
-    number: Int64[np.ndarray, "n"]
-    columns: Mapping[str, np.ndarray]
-
-    def __len__(self) -> int:
-        return len(self.number)
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.columns[name]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.columns
-
-    def take(self, rows: np.ndarray) -> "_Rows":
-        return _Rows(self.table, self.number[rows], {name: column[rows] for name, column in self.columns.items()})
-
-    def first(self, name: str, default: Any = None) -> Any:
-        """Value of the first row in a column, or the default without such a column."""
-        return self.columns[name][0] if name in self.columns else default
-
-    def error(self, row: int | np.integer, cause: str) -> DataError:
-        return DataError(f"{self.table}: row {self.number[row]}: {cause}")
-
-    def check(self, is_broken: Bool[np.ndarray, "n"], cause: str, *values: np.ndarray) -> None:
-        """Raise a `DataError` at the first broken row; the cause is formatted with the row's values."""
-        if is_broken.any():
-            row = int(np.argmax(is_broken))
-            raise self.error(row, cause.format(*(column[row] for column in values)))
 
 
 class TablesSource:
@@ -188,7 +161,7 @@ def _find_tracks(path: str | os.PathLike[str]) -> list[Path]:
     return sorted(Path(path).rglob(TRACKS)) if Path(path).is_dir() else []
 
 
-def _read_scenario(row: _Rows, tables: Mapping[str, _Rows]) -> Scenario:
+def _read_scenario(row: Rows, tables: Mapping[str, Rows]) -> Scenario:
     """Scenario of a row of `scenarios.parquet`.
 
     Args:
@@ -243,7 +216,7 @@ def _read_scenario(row: _Rows, tables: Mapping[str, _Rows]) -> Scenario:
     )
 
 
-def _read_tracks(rows: _Rows, first_step: int, step_s: float, ground: MapFeatures | None) -> tuple[Tracks, set[str]]:
+def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures | None) -> tuple[Tracks, set[str]]:
     """Tracks at 10 Hz, and the words for guessed values of the tracks.
 
     Args:
@@ -357,7 +330,7 @@ def _choose_predicted(tracks: Tracks, ego: int) -> list[int]:
     return sorted(nearest.tolist())
 
 
-def _find_indices(row: _Rows, name: str, tracks: Tracks) -> list[int] | None:
+def _find_indices(row: Rows, name: str, tracks: Tracks) -> list[int] | None:
     """Track indices of a list of object ids; None without a list."""
     ids = row.first(name)
     if ids is None:
@@ -371,7 +344,7 @@ def _find_indices(row: _Rows, name: str, tracks: Tracks) -> list[int] | None:
     return [index[object_id] for object_id in ids]
 
 
-def _read_map(rows: _Rows, lanes: _Rows | None) -> MapFeatures:
+def _read_map(rows: Rows, lanes: Rows | None) -> MapFeatures:
     """Map features in the order of first rows."""
     feature_type = _read_numbers(rows, "type", MapFeatureType)
     _check_numbers(rows)
@@ -388,7 +361,7 @@ def _read_map(rows: _Rows, lanes: _Rows | None) -> MapFeatures:
     return MapFeatures.of(features, _read_topology(lanes, features))
 
 
-def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.ndarray]]) -> LaneTopology:
+def _read_topology(rows: Rows | None, features: Sequence[tuple[int, int, np.ndarray]]) -> LaneTopology:
     """Links between lanes of the map; links to further lanes are left out."""
     if rows is None:
         return LaneTopology()
@@ -416,7 +389,7 @@ def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.nda
     return LaneTopology.of(**links, speed_limit_mph=speed_limit, interpolating=interpolating)
 
 
-def _check_edge_directions(rows: _Rows, features: MapFeatures) -> None:
+def _check_edge_directions(rows: Rows, features: MapFeatures) -> None:
     """Check that road edges have the road on the left: outer edges run counter-clockwise, edges of islands clockwise.
 
     Raises:
@@ -444,7 +417,7 @@ def _check_edge_directions(rows: _Rows, features: MapFeatures) -> None:
 
 
 def _read_lights(
-    rows: _Rows | None, first_step: int, step_s: float, num_steps: int, features: MapFeatures
+    rows: Rows | None, first_step: int, step_s: float, num_steps: int, features: MapFeatures
 ) -> LightStates:
     """Lights at 10 Hz: of each lane the last state that is not older than a step of the recording."""
     if rows is None:
@@ -469,15 +442,15 @@ def _read_lights(
     return LightStates.of(sorted(lights, key=lambda light: light[:2]))
 
 
-def _check_numbers(rows: _Rows) -> None:
+def _check_numbers(rows: Rows) -> None:
     """Raise a `DataError` at the first NaN, infinite or huge number in a column of numbers."""
     needed, optional = _SCHEMAS[rows.table]
     for name, content in (needed | optional).items():
-        if content == _NUMBERS and name in rows:
+        if content == NUMBERS and name in rows:
             rows.check(~(np.abs(rows[name]) < _MAX_COORDINATE_M), name + " is {:g}", rows[name])  # NaN, too
 
 
-def _check_repeated(rows: _Rows, *names: str) -> None:
+def _check_repeated(rows: Rows, *names: str) -> None:
     """Raise a `DataError` at the first row that repeats the values of an earlier row in some columns."""
     columns = [rows[name] for name in names]
     _, first, owner = np.unique(np.column_stack(columns), axis=0, return_index=True, return_inverse=True)
@@ -486,7 +459,7 @@ def _check_repeated(rows: _Rows, *names: str) -> None:
     rows.check(is_repeated, f"a second row with {cells}: every row needs its own", *columns)
 
 
-def _read_numbers(rows: _Rows, name: str, enumeration: type[IntEnum]) -> Int64[np.ndarray, "n"]:
+def _read_numbers(rows: Rows, name: str, enumeration: type[IntEnum]) -> Int64[np.ndarray, "n"]:
     """Numbers of a column that holds numbers or names."""
     numbers: dict[Any, int] = {member.name.lower(): int(member) for member in enumeration}
     numbers |= {int(member): int(member) for member in enumeration}
@@ -506,19 +479,19 @@ def _group(keys: np.ndarray) -> list[tuple[Any, Int64[np.ndarray, "_"]]]:
     return list(zip(values, np.split(order, np.cumsum(counts)[:-1])))
 
 
-def _group_rows(table: _Rows) -> dict[tuple[str, str], np.ndarray]:
+def _group_rows(table: Rows) -> dict[tuple[str, str], np.ndarray]:
     """Rows of a table by scenario or map: by the name of the key column, and the id."""
     keys = [key for key in ("scenario_id", "map_id") if key in table]
     return {(key, str(value)): indices for key in keys for value, indices in _group(table[key].astype(str))}
 
 
-def _select_rows(table: _Rows, row_groups: Mapping[tuple[str, str], np.ndarray], row: _Rows) -> _Rows:
+def _select_rows(table: Rows, row_groups: Mapping[tuple[str, str], np.ndarray], row: Rows) -> Rows:
     """Rows of a table that belong to a scenario, by scenario id or map id."""
     keys = [(key, str(row[key][0])) for key in ("scenario_id", "map_id") if key in row and key in table]
     return table.take(next((row_groups[key] for key in keys if key in row_groups), np.zeros(0, np.int64)))
 
 
-def _read_table(path: Path) -> _Rows:
+def _read_table(path: Path) -> Rows:
     """Table with the columns of the contract, in the types of the contract.
 
     Raises:
@@ -528,52 +501,7 @@ def _read_table(path: Path) -> _Rows:
         table = read_parquet(path, "write it again")
     except FileNotFoundError:
         raise DataError(f"{path.name}: there is no such table beside {TRACKS}") from None
-    needed, optional = _SCHEMAS[path.name]
-    for name in needed:
-        if name not in table.schema.names:
-            raise DataError(f"{path.name} has no column {name}")
-    if path.name in (MAP, LANES) and not {"scenario_id", "map_id"} & set(table.schema.names):
+    rows = read_rows(path.name, table, *_SCHEMAS[path.name])
+    if path.name in (MAP, LANES) and "scenario_id" not in rows and "map_id" not in rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")
-    columns = {}
-    for name, content in (needed | optional).items():
-        if name in table.schema.names:
-            columns[name] = _read_column(path.name, name, table[name], content)
-    return _Rows(path.name, np.arange(table.num_rows), columns)
-
-
-def _read_column(table: str, name: str, column: pa.ChunkedArray, content: str) -> np.ndarray:
-    """A column as an array: float64, int64, bool, or objects for text and lists."""
-    types, cell_type = pa.types, column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    is_list = types.is_list(cell_type) or types.is_large_list(cell_type)
-    item_type = cell_type.value_type if is_list else cell_type
-    is_text, has_text_items = (
-        types.is_string(value_type) or types.is_large_string(value_type) or types.is_string_view(value_type)
-        for value_type in (cell_type, item_type)
-    )
-    fits = {
-        _WORDS: is_text or types.is_integer(cell_type) or types.is_null(cell_type),
-        _NUMBERS: types.is_floating(cell_type) or types.is_integer(cell_type),
-        _INTEGERS: types.is_integer(cell_type),
-        _LISTS: (is_list and types.is_integer(item_type)) or types.is_null(item_type),
-        _WORD_LISTS: (is_list and has_text_items) or types.is_null(item_type),
-        _EITHER: is_text or types.is_integer(cell_type),
-        _TRUTH: types.is_boolean(cell_type),
-    }[content]
-    if not fits:
-        raise DataError(f"{table}: column {name} is {column.type}, it must have {content}")
-    # empty lists and licenses are allowed, empty numbers are NaN, which is an error where it matters
-    if column.null_count and content not in (_LISTS, _WORD_LISTS, _NUMBERS) and name != "license":
-        row = np.flatnonzero(column.is_null().to_numpy())[0]
-        raise DataError(f"{table}: row {row}: {name} is empty")
-    try:
-        if content == _NUMBERS:
-            return column.cast(pa.float64()).to_numpy()
-        if content == _INTEGERS:
-            return column.cast(pa.int64()).to_numpy()
-        if content == _TRUTH:
-            return column.to_numpy()
-        values = np.empty(len(column), object)
-        values[:] = column.to_pylist()
-        return np.array([str(v) if v is not None else None for v in values], object) if content == _WORDS else values
-    except pa.ArrowException as error:
-        raise DataError(f"{table}: column {name}: {error}") from None
+    return rows

@@ -32,7 +32,12 @@ from rlftsim.scenario.types import (
 )
 
 _TFRECORD_NAME = re.compile(r"\.tfrecords?(-\d+-of-\d+)?$")
-_LEFT, _RIGHT = 0, 1
+_FIRST_TYPES = {
+    "lane": MapFeatureType.LANE_UNDEFINED,
+    "road_line": MapFeatureType.LINE_UNKNOWN,
+    "road_edge": MapFeatureType.EDGE_UNKNOWN,
+}
+"""Feature type that WOMD's own number 0 of a member stands for."""
 _STATE_FIELDS = (
     *("center_x", "center_y", "center_z", "length", "width", "height"),
     *("heading", "velocity_x", "velocity_y", "valid"),
@@ -246,22 +251,12 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
 
 def _read_points(feature: womd_pb2.MapFeature, member: str) -> tuple[int, Sequence[womd_pb2.MapPoint]]:
     """Type of a map feature (numbers of `MapFeatureType`) and the points."""
-    match member:
-        case "lane":
-            return feature.lane.type, feature.lane.polyline
-        case "road_line":
-            return MapFeatureType.LINE_UNKNOWN + feature.road_line.type, feature.road_line.polyline
-        case "road_edge":
-            return MapFeatureType.EDGE_UNKNOWN + feature.road_edge.type, feature.road_edge.polyline
-        case "stop_sign":
-            return MapFeatureType.STOP_SIGN, [feature.stop_sign.position]
-        case "crosswalk":
-            return MapFeatureType.CROSSWALK, feature.crosswalk.polygon
-        case "speed_bump":
-            return MapFeatureType.SPEED_BUMP, feature.speed_bump.polygon
-        case "driveway":
-            return MapFeatureType.DRIVEWAY, feature.driveway.polygon
-    raise AssertionError(f"womd.proto has a kind of map feature that is not read: {member}")
+    data = getattr(feature, member)
+    if member == "stop_sign":
+        return MapFeatureType.STOP_SIGN, [data.position]
+    if member in _FIRST_TYPES:
+        return _FIRST_TYPES[member] + data.type, data.polyline
+    return MapFeatureType[member.upper()], data.polygon  # crosswalk, speed bump or driveway
 
 
 def _read_topology(features: Sequence[womd_pb2.MapFeature], members: Sequence[str]) -> LaneTopology:
@@ -274,11 +269,11 @@ def _read_topology(features: Sequence[womd_pb2.MapFeature], members: Sequence[st
     interpolating[is_lane] = [lane.interpolating for _, lane in lanes]
     neighbors, boundaries = [], []
     for lane_id, lane in lanes:
-        for side, links in ((_LEFT, lane.left_neighbors), (_RIGHT, lane.right_neighbors)):
+        for side, links in enumerate((lane.left_neighbors, lane.right_neighbors)):
             for n in links:
                 spans = (n.self_start_index, n.self_end_index, n.neighbor_start_index, n.neighbor_end_index)
                 neighbors.append((lane_id, side, n.feature_id, *spans))
-        for side, links in ((_LEFT, lane.left_boundaries), (_RIGHT, lane.right_boundaries)):
+        for side, links in enumerate((lane.left_boundaries, lane.right_boundaries)):
             for b in links:
                 span = (b.lane_start_index, b.lane_end_index)
                 boundaries.append((lane_id, side, b.boundary_feature_id, *span, b.boundary_type))
