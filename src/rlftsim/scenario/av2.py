@@ -69,6 +69,7 @@ SIZES_M = {
 """Length, width and height where no file of sizes is given; the ego has the size of the recording vehicles."""
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 FOCAL, SCORED = 3, 2
+_CUT_TRACKS = "tracks to predict not evaluated, as they leave the ground that the map covers"
 _NEEDED = (
     dict.fromkeys(("track_id", "object_type", "scenario_id"), WORDS)
     | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), NUMBERS)
@@ -143,9 +144,7 @@ class Av2Source:
                     yield scenario
                     record += 1
                     if num_cut:
-                        yield Tally(
-                            "tracks to predict not evaluated, as they leave the ground that the map covers", num_cut
-                        )
+                        yield Tally(_CUT_TRACKS, num_cut)
             except DataError as error:
                 yield SkippedRecord(_parse_id(file), record, str(error))
                 record += 1
@@ -167,12 +166,8 @@ class Av2Source:
 def find_files(path: str | os.PathLike[str]) -> list[Path]:
     """Parquet files of scenarios at a path, by id: a file, a folder with its subfolders, or a glob of either."""
     paths = [path] if os.path.exists(path) else glob.glob(str(path), recursive=True)
-    files = {
-        file
-        for match in map(Path, paths)
-        for file in (match.rglob("scenario_*.parquet") if match.is_dir() else [match])
-        if file.name.startswith("scenario_") and file.suffix == ".parquet"
-    }
+    matches = [match for path in map(Path, paths) for match in (path.rglob("*") if path.is_dir() else [path])]
+    files = {file for file in matches if file.name.startswith("scenario_") and file.suffix == ".parquet"}
     return sorted(files, key=lambda file: (_parse_id(file), str(file)))
 
 

@@ -47,9 +47,8 @@ def describe_contradictions(tracks: Tracks) -> str:
     if 2 * len(contrary) > num_judged:
         track = contrary[0]
         steps = is_moving[track] & is_off[track]
-        by_position, by_velocity, difference = (
-            float(np.median(v[track, steps])) for v in (moved_mps, said_mps, off_mps)
-        )
+        medians = (float(np.median(speed[track, steps])) for speed in (moved_mps, said_mps, off_mps))
+        by_position, by_velocity, difference = medians
         texts.append(
             f"velocities contradict the change of positions in {len(contrary)} of {num_judged} moving tracks: track "
             f"{tracks.object_id[track]} moves at {by_position:.1f} m/s, its velocity is {by_velocity:.1f} m/s and "

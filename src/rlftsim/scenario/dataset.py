@@ -489,10 +489,9 @@ def _missing_manifest_hint(folder: Path) -> str:
         return "there is no such folder" + (f", did you mean {SYNTHETIC!r}?" if matches else "")
     # also one level down: WOMD has a folder per split
     has_source = any(next(folder.glob(pattern), None) for pattern in ("*.tfrecord*", "*/*.tfrecord*"))
-    remedy = (
-        "its tfrecord files have to be converted first" if has_source else "name a folder that `rlftsim convert` wrote"
-    )
-    return f"it has no {MANIFEST}; {remedy}, or {SYNTHETIC!r}"
+    if has_source:
+        return f"it has no {MANIFEST}; its tfrecord files have to be converted first, or {SYNTHETIC!r}"
+    return f"it has no {MANIFEST}; name a folder that `rlftsim convert` wrote, or {SYNTHETIC!r}"
 
 
 def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
@@ -567,9 +566,8 @@ def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, 
             # the first of equal ids is indexed; the others stay in their shards, reported as duplicates
             is_first.append(scenario_id not in first_locations)
             record = row if record is None else record
-            location, first_split = first_locations.setdefault(
-                scenario_id, (f"{names[entry.file]} record {record}", split)
-            )
+            location = f"{names[entry.file]} record {record}"
+            location, first_split = first_locations.setdefault(scenario_id, (location, split))
             if is_first[-1]:
                 continue
             cause = f"scenario {scenario_id} is already in {location}; the first is kept"
@@ -587,6 +585,4 @@ def names_of_shards(entries: Iterable[ShardEntry]) -> dict[str, str]:
     """Name in messages by shard file: the source, or the file where the source has not exactly one shard."""
     entries = list(entries)
     num_shards = Counter(entry.source for entry in entries)
-    return {
-        entry.file: entry.source if entry.source and num_shards[entry.source] == 1 else entry.file for entry in entries
-    }
+    return {entry.file: (num_shards[entry.source] == 1 and entry.source) or entry.file for entry in entries}

@@ -20,6 +20,7 @@ from rlftsim.scenario.dataset import (
     load_index,
     read_manifest,
 )
+from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import ShardReader, hash_file
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, STEP_S, ObjectType, Scenario
 
@@ -147,9 +148,7 @@ def dataset_stats(
     dataset = ScenarioDataset(folder, split, cache_size=0)
     index = dataset.index
     num_scenarios = max(len(dataset), 1)
-    agents = {
-        name: int(sum(index[f"num_{name}"].to_pylist())) for name in ("vehicles", "pedestrians", "cyclists", "others")
-    }
+    agents = {name.removeprefix("num_"): int(sum(index[name].to_pylist())) for name in AGENT_COLUMNS}
     positions = np.unique(np.linspace(0, len(dataset) - 1, min(max_speed_scenarios, len(dataset))).astype(int))
     # a shard holds scenarios of all splits, so the size is that of the whole data set
     total_bytes = sum((dataset.folder / entry.file).stat().st_size for entry in dataset.manifest.shards)
@@ -209,10 +208,8 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
     entries = np.argwhere(speed > TELEPORT_SPEED_MPS)
     if len(entries):
         track, step = entries[0]
-        moves = f"track {tracks.object_id[track]} moves {speed[track, step] * STEP_S:.1f} m"
-        yield Finding(
-            Problem.TELEPORT, scenario_id, f"{moves} from step {step} to {step + 1}{_format_repeats(len(entries))}"
-        )
+        detail = f"track {tracks.object_id[track]} moves {speed[track, step] * STEP_S:.1f} m from step {step} to "
+        yield Finding(Problem.TELEPORT, scenario_id, f"{detail}{step + 1}{_format_repeats(len(entries))}")
 
     features = scenario.map_features
     required = (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
@@ -227,9 +224,8 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
             detail = f"its nearest point is {nearest:.0f} m from the ego: give map and tracks the same origin"
             yield Finding(Problem.MAP_ELSEWHERE, scenario_id, detail)
     if not (scenario.evaluated_indices != scenario.ego_index).any():
-        consequence = (
-            "only the ego is evaluated" if len(scenario.evaluated_indices) else "nor is the ego: nothing is evaluated"
-        )
+        has_ego = len(scenario.evaluated_indices) > 0
+        consequence = "only the ego is evaluated" if has_ego else "nor is the ego: nothing is evaluated"
         detail = f"no track to predict is valid at the current step, {consequence}"
         yield Finding(Problem.NO_EVALUATED_AGENTS, scenario_id, detail)
 

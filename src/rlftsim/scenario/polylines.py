@@ -35,9 +35,8 @@ def densify(points: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndar
     distance = arc_length(points)
     num_steps = np.maximum(1, np.ceil(np.diff(distance) / spacing_m)).astype(int)  # [n-1] of each segment
     # number of the segment and the fraction of it, so that the given points come back exactly
-    index = np.append(
-        np.concatenate([k + np.arange(count) / count for k, count in enumerate(num_steps)]), len(num_steps)
-    )
+    fractions = [k + np.arange(count) / count for k, count in enumerate(num_steps)]
+    index = np.append(np.concatenate(fractions), len(num_steps))
     return np.stack([np.interp(index, np.arange(len(points)), points[:, k]) for k in range(2)], axis=1)
 
 

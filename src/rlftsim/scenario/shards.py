@@ -65,14 +65,9 @@ _ARRAY_DTYPES = {
 }
 _INDEX_TYPES = {str: pa.string(), int: pa.int32()}
 INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in fields(IndexRow))
+_ROW_FIELDS = (("source_record", pa.int32()), ("ego_index", pa.int32()), ("checksum", pa.uint32()))
 _SCHEMA = pa.schema(
-    [
-        *INDEX_FIELDS,
-        pa.field("source_record", pa.int32()),
-        pa.field("ego_index", pa.int32()),
-        pa.field("checksum", pa.uint32()),
-        *(pa.field(name, pa.binary()) for name in _ARRAY_DTYPES),
-    ],
+    [*INDEX_FIELDS, *_ROW_FIELDS, *((name, pa.binary()) for name in _ARRAY_DTYPES)],
     metadata={"format": "rlftsim scenarios", "schema_version": str(SCHEMA_VERSION)},
 )
 
@@ -111,14 +106,9 @@ class ShardWriter:
         check_scenario(scenario)
         # every array separately: each has the encoding that suits the values
         encoded = {name: None if array is None else encode_array(array) for name, array in _to_arrays(scenario).items()}
-        row = {
-            **asdict(compute_index_row(scenario, split)),
-            "source_record": source_record,
-            "ego_index": scenario.ego_index,
-            "checksum": _checksum(encoded),
-            **encoded,
-        }
-        self._pending.append(row)
+        row = asdict(compute_index_row(scenario, split)) | {"source_record": source_record}
+        row |= {"ego_index": scenario.ego_index, "checksum": _checksum(encoded)}
+        self._pending.append(row | encoded)
         self.num_rows += 1
         if len(self._pending) == _ROWS_PER_BATCH:
             self._flush()
@@ -195,9 +185,7 @@ class ShardReader:
             if _checksum(encoded) != self._table["checksum"][row].as_py():
                 raise ValueError("its checksum does not match")
             # None only where `types.py` allows it, which the checksum has just confirmed
-            arrays: dict[str, Any] = {
-                name: None if data is None else decode_array(data) for name, data in encoded.items()
-            }
+            arrays = {name: None if data is None else decode_array(data) for name, data in encoded.items()}
             names = ("scenario_id", "ego_index", "source", "guessed")
             plain = {name: self._table[name][row].as_py() for name in names}
             scenario = _from_arrays(plain, arrays)

@@ -84,9 +84,8 @@ def guessed_note(sources: Iterable[str], guessed: Iterable[str]) -> str:
     words, names = sorted(set(guessed)), sorted(set(sources))
     if not words:
         return ""
-    return (
-        f"Data of {', '.join(names)} with guessed {', '.join(words)}: scores compare with others on the same data only."
-    )
+    data = f"Data of {', '.join(names)} with guessed {', '.join(words)}"
+    return f"{data}: scores compare with others on the same data only."
 
 
 def _load_source(name: str, options: Mapping[str, object] | None = None) -> DataSource:

@@ -141,13 +141,12 @@ class TablesSource:
             raise DataError(f"{SCENARIOS} has no rows: each row makes a scenario")
         if "scenario_id" not in tables[MAP] and "map_id" not in scenarios:
             raise DataError(f"{SCENARIOS} has no column map_id, which the maps in {MAP} are named by")
-        row_groups = {name: _group_rows(table) for name, table in tables.items()}
+        row_groups = {name: _group_rows(table) for name, table in tables.items() if name != SCENARIOS}
         for record in range(len(scenarios)):
             row = scenarios.take(np.array([record]))
             try:
-                yield _read_scenario(
-                    row, {n: _select_rows(tables[n], row_groups[n], row) for n in tables if n != SCENARIOS}
-                )
+                selected = {name: _select_rows(tables[name], row_groups[name], row) for name in row_groups}
+                yield _read_scenario(row, selected)
             except DataError as error:
                 yield SkippedRecord(unit.name, record, f"scenario {row['scenario_id'][0]}: {error}")
         yield BytesRead(sum(file.stat().st_size for file in unit.files))
@@ -236,9 +235,8 @@ def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures
     has_same_step = is_same_object & (np.diff(step, prepend=step[:1]) == 0)
     rows.check(has_same_step, "object {} has a second row for step {}", ids, step)
     object_type = _read_numbers(rows, "type", ObjectType)
-    rows.check(
-        is_same_object & (np.diff(object_type, prepend=object_type[:1]) != 0), "object {} has a second type", ids
-    )
+    has_second_type = is_same_object & (np.diff(object_type, prepend=object_type[:1]) != 0)
+    rows.check(has_second_type, "object {} has a second type", ids)
     seconds = (step - first_step) * step_s  # [n]
     gap_s = np.diff(seconds, prepend=seconds[:1])
     moved = np.linalg.norm([np.diff(rows[name], prepend=rows[name][:1]) for name in ("x", "y")], axis=0)

@@ -178,9 +178,8 @@ def _stub_ends(
     """Streets by which traffic enters, as (node, outer end, line): one or none at each end of every line."""
     columns, rows = grid.shape[:2]
     ends = [((i, j), (i, inner), i) for i in range(columns) for j, inner in ((0, 1), (rows - 1, rows - 2))]
-    ends += [
-        ((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in ((0, 1), (columns - 1, columns - 2))
-    ]
+    borders = ((0, 1), (columns - 1, columns - 2))
+    ends += [((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in borders]
     stubs = []
     for outer, inner, line in ends:
         if classes[line] != "arterial" and rng.random() < 0.25:
@@ -218,15 +217,11 @@ def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
         degree[b] += 1
     for a, _, _ in stubs:
         degree[a] += 1
-    inner = {
-        (i, j): Node(
-            f"n{i}{j}",
-            grid[i, j] * shrink,
-            _draw_control(rng, (classes[i], classes[columns + j]), int(degree[i, j]), 0.2 if quiet else 1.0),
-        )
-        for i in range(columns)
-        for j in range(rows)
-    }
+    inner = {}
+    for i, j in np.ndindex(columns, rows):
+        crossing = (classes[i], classes[columns + j])
+        control = _draw_control(rng, crossing, int(degree[i, j]), 0.2 if quiet else 1.0)
+        inner[i, j] = Node(f"n{i}{j}", grid[i, j] * shrink, control)
     fringe = [Node(f"f{k}", end * shrink, "dead_end", is_fringe=True) for k, (_, end, _) in enumerate(stubs)]
     # 3. Both directions of every street.
     streets: list[Street] = []

@@ -101,10 +101,8 @@ class MapCropper:
         grid_points = np.column_stack([on_grid(points, MAP_GRID_PER_M), height])
         ends_of_stretches = np.cumsum([len(polyline) for _, _, polyline in stretches])
         lines = np.split(grid_points, ends_of_stretches)
-        return MapFeatures.of(
-            [(feature_id, feature.feature_type, line) for (feature_id, feature, _), line in zip(stretches, lines)],
-            topology,
-        )
+        ids, types = [feature_id for feature_id, _, _ in stretches], [feature.feature_type for feature in features]
+        return MapFeatures.of(zip(ids, types, lines), topology)
 
 
 def cut_feature(feature: Feature, inside: Bool[np.ndarray, "n"]) -> list[Float[np.ndarray, "m 2"]]:

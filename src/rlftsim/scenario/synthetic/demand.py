@@ -50,9 +50,7 @@ def draw_size(rng: np.random.Generator, name: str) -> tuple[float, float, float]
         rng: Generator of the sizes, one draw for each.
         name: Name of the road user in `_SIZES`, such as "car" or "pedestrian".
     """
-    length, width, height = (
-        float(np.clip(rng.normal(mean, spread), low, high)) for mean, spread, low, high in _SIZES[name]
-    )
+    length, width, height = (float(np.clip(rng.normal(mean, std), low, high)) for mean, std, low, high in _SIZES[name])
     return length, width, height
 
 

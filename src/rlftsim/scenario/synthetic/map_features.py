@@ -102,9 +102,8 @@ def _mouth(network: Network, street: Street, node_id: str) -> Any:
     leftmost = network.lane((street.street_id, len(street.lanes) - 1))
     end = leftmost.shape[-2:] if street.to_node == node_id else leftmost.shape[:2]
     tangent = (end[1] - end[0]) / max(float(np.linalg.norm(end[1] - end[0])), 1e-6)
-    line = np.stack(
-        [end[1], end[1] + MOUTH_M * tangent] if street.to_node == node_id else [end[0] - MOUTH_M * tangent, end[0]]
-    )
+    reach = MOUTH_M * tangent
+    line = np.stack([end[1], end[1] + reach] if street.to_node == node_id else [end[0] - reach, end[0]])
     width = sum(lane.width_m for lane in street.lanes if lane.lane_type not in ("sidewalk", "parking"))
     return _strip(line, leftmost.width_m / 2, width - leftmost.width_m / 2)
 
@@ -115,16 +114,10 @@ def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> An
     shape = shapely.Polygon(network.junction_shapes[node_id]).buffer(0)
     # streets count up to 14 m before the junction, far enough to round the corners between them
     surroundings = shape.buffer(14.0)
-    areas = [
-        shapely.LineString(connector.shape).buffer(connector.width_m / 2 + 0.2, cap_style="flat")
-        for connector in network.connectors
-        if connector.junction == node_id and len(connector.shape) > 1
-    ]
-    areas += [
-        shapely.LineString(line).buffer(width / 2, cap_style="flat")
-        for junction, line, width in network.crosswalks
-        if junction == node_id
-    ]
+    connectors = [c for c in network.connectors if c.junction == node_id and len(c.shape) > 1]
+    strokes = [(connector.shape, connector.width_m / 2 + 0.2) for connector in connectors]
+    strokes += [(line, width / 2) for junction, line, width in network.crosswalks if junction == node_id]
+    areas = [shapely.LineString(line).buffer(reach, cap_style="flat") for line, reach in strokes]
     streets = [street for street in network.plan.streets if node_id in (street.from_node, street.to_node)]
     areas += [strips[street.street_id].intersection(surroundings) for street in streets]
     areas += [_mouth(network, street, node_id).intersection(shape) for street in streets]
@@ -150,9 +143,8 @@ def compute_drivable_area(network: Network) -> Any:
     if network.plan.network_type != "freeway":
         return area
     # One carriageway at a time: smoothing both at once would close a narrow median here and there.
-    return shapely.union_all(
-        [carriageway.buffer(2.0).buffer(-4.0).buffer(2.0) for carriageway in getattr(area, "geoms", [area])]
-    )
+    carriageways = getattr(area, "geoms", [area])
+    return shapely.union_all([carriageway.buffer(2.0).buffer(-4.0).buffer(2.0) for carriageway in carriageways])
 
 
 def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:
@@ -219,9 +211,7 @@ def _left_border(network: Network, lane: Lane) -> Float[np.ndarray, "n 2"]:
     street = lane.street
     assert street is not None
     if network.plan.network_type == "freeway":
-        return offset_polyline(
-            street.points, -sum(planned_lane.width_m for planned_lane in street.lanes[lane.index + 1 :])
-        )
+        return offset_polyline(street.points, -sum(planned.width_m for planned in street.lanes[lane.index + 1 :]))
     return offset_polyline(resample(lane.shape, 2.0), lane.width_m / 2)
 
 
@@ -248,9 +238,8 @@ def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
         driven = [lane for lane in lanes if lane.lane_type in ("travel", "bicycle")]
         solid_tail = network.plan.network_type != "freeway" and street.to_node not in fringe
         for lane, left in pairwise(driven):
-            rows += _between_lanes(
-                _left_border(network, lane), "bicycle" in (lane.lane_type, left.lane_type), solid_tail
-            )
+            has_bicycles = "bicycle" in (lane.lane_type, left.lane_type)
+            rows += _between_lanes(_left_border(network, lane), has_bicycles, solid_tail)
         # To the left of a direction: a line along a median, or a shared line between the directions.
         separator = resample(_left_border(network, driven[-1]))
         if street.reverse_id is None:
@@ -302,9 +291,8 @@ def build_network_map(network: Network) -> NetworkMap:
             lane_ids[lane.lane_id] = _add(_lane_type(lane), resample(lane.shape), lane.speed_mps)
     connectors = [c for c in network.connectors if c.junction not in fringe and len(c.shape) > 1]
     for connector in connectors:
-        feature_type = (
-            MapFeatureType.LANE_BIKE if connector.is_bicycle else _lane_type(network.lane(connector.from_lane))
-        )
+        origin = network.lane(connector.from_lane)
+        feature_type = MapFeatureType.LANE_BIKE if connector.is_bicycle else _lane_type(origin)
         lane_ids[connector.lane_ids[0]] = _add(feature_type, resample(connector.shape), connector.speed_mps, True)
 
     # 2. Lines, edges, crosswalks, stop signs.
@@ -333,14 +321,13 @@ def build_network_map(network: Network) -> NetworkMap:
             neighbor_id = f"{lane.street.street_id}_{lane.index + step}"
             if neighbor_id in lane_ids:
                 neighbors.append((lane_ids[lane.lane_id], side, lane_ids[neighbor_id]))
+    lights = [(c.light, c.link_index, lane_ids[c.lane_ids[0]], c.direction) for c in connectors if c.light is not None]
     return NetworkMap(
         features=tuple(features),
         lane_ids=lane_ids,
         entry_exit=tuple(entry_exit),
         neighbors=tuple(neighbors),
         stop_sign_lanes=tuple(signs),
-        light_lanes=tuple(
-            (c.light, c.link_index, lane_ids[c.lane_ids[0]], c.direction) for c in connectors if c.light is not None
-        ),
+        light_lanes=tuple(lights),
         drivable=area,
     )

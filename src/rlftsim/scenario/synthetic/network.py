@@ -147,11 +147,8 @@ def read_network(path: Path, plan: StreetPlan) -> Network:
         for row in root.iter("junction")
         if row.get("type") != "internal" and len(row.get("shape", "").split()) >= 3
     }
-    crosswalks = tuple(
-        (lane.lane_id[1:].rsplit("_", 2)[0], lane.shape, lane.width_m)
-        for lane in lanes.values()
-        if lane.lane_type == "crossing"
-    )
+    crossings = [lane for lane in lanes.values() if lane.lane_type == "crossing"]
+    crosswalks = tuple((lane.lane_id[1:].rsplit("_", 2)[0], lane.shape, lane.width_m) for lane in crossings)
     return Network(
         plan=plan,
         lanes=lanes,

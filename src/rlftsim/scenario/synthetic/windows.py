@@ -171,10 +171,8 @@ def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: An
     ]
     # 2. Their order: by distance traveled with some noise.
     traveled = np.minimum(view.traveled_m, 40.0)
-    rank = {
-        k: traveled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.0) + rng.normal(0, 8.0)
-        for k in candidates
-    }
+    is_vehicle = [body.object_type == ObjectType.VEHICLE for body in view.bodies]
+    rank = {k: traveled[k] * (1.0 if is_vehicle[k] else 2.0) + rng.normal(0, 8.0) for k in candidates}
     num_tracks = int(rng.choice([2, 3, 4, 5, 6, 7, 8], p=[0.14, 0.18, 0.2, 0.16, 0.13, 0.1, 0.09]))
     moving = sorted((k for k in candidates if traveled[k] > 1.0), key=lambda k: -rank[k])
     standing = [k for k in candidates if traveled[k] <= 1.0]
@@ -196,9 +194,7 @@ def _observe_lights(
     world: World, features: MapFeatures, start: int, ego_path: Float[np.ndarray, "n 2"], range_m: float
 ) -> LightStates:
     """State of every light whose lane begins within the range, per step."""
-    first_point = {
-        int(features.feature_id[k]): features.points[features.offsets[k]] for k in range(len(features.feature_id))
-    }
+    first_point = dict(zip(features.feature_id.tolist(), features.points[features.offsets[:-1]]))
     # 1. Lights that the ego ever comes near, and whose lane is not cut at its beginning.
     lights = []
     for junction, link, lane_id, direction in world.cropper.network_map.light_lanes:
@@ -211,12 +207,12 @@ def _observe_lights(
             arrow = direction in "lL" and world.signals[junction].has_protected_phase(link)
             lights.append((junction, link, lane_id, stop_point, arrow))
     # 2. Their states, step by step.
-    rows = [
-        (step, lane_id, _LIGHT_STATES.get(world.signals[junction].states[start + step][link], _STOP)[arrow], stop)
-        for step in range(TOTAL_STEPS)
-        for junction, link, lane_id, stop, arrow in lights
-    ]
-    return LightStates.of([(step, lane_id, state, *stop) for step, lane_id, state, stop in rows])
+    rows = []
+    for step in range(TOTAL_STEPS):
+        for junction, link, lane_id, stop, arrow in lights:
+            letter = world.signals[junction].states[start + step][link]
+            rows.append((step, lane_id, _LIGHT_STATES.get(letter, _STOP)[arrow], *stop))
+    return LightStates.of(rows)
 
 
 def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
@@ -231,16 +227,11 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
     z = world.cropper.ground.height_at(position) + size[:, None, 2] / 2
     heading = np.arctan2(np.sin(heading), np.cos(heading))
     valid = view.valid
+    xy = on_grid(position * valid[..., None], POSITION_GRID_PER_M)
     return Tracks(
         object_id=np.cumsum(rng.integers(1, 9, len(view.bodies))).astype(np.int64),
         object_type=np.array([body.object_type for body in view.bodies], np.int8),
-        position=np.concatenate(
-            [
-                on_grid(position * valid[..., None], POSITION_GRID_PER_M),
-                on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None],
-            ],
-            axis=-1,
-        ),
+        position=np.concatenate([xy, on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None]], axis=-1),
         heading=on_grid(heading * valid, HEADING_GRID_PER_RAD),
         velocity=on_grid(velocity * valid[..., None], VELOCITY_GRID_PER_MPS),
         size=on_grid(size[:, None] * valid[..., None], SIZE_GRID_PER_M),
