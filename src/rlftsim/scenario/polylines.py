@@ -29,7 +29,7 @@ def densify(points: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndar
     """Polyline of the same shape with further points between the given ones.
 
     Args:
-        points: Polyline with n points in the plane, m; all of them are in the result.
+        points: Polyline with n points in the plane, m; the result has all points.
         spacing_m: Largest distance between two points of the result, m.
     """
     distance = arc_length(points)

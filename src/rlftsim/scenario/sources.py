@@ -45,7 +45,7 @@ SOURCES: ExtensionPoint[Any] = ExtensionPoint(
 
 
 def find_source(reader: str, path: str | os.PathLike[str], options: Mapping[str, object] | None = None) -> DataSource:
-    """Source of a name, or for "auto" the one that recognizes the files at a path.
+    """Source of a name, or for "auto" the source that recognizes the files at a path.
 
     Args:
         reader: Name in `SOURCES`, or "auto".

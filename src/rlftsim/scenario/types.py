@@ -2,10 +2,10 @@
 
 Units: meters, seconds, radians, meters per second. Headings are counter-clockwise from +x. Frame: the *world* frame of
 the log. Coordinates are float32 from reading on, because the official evaluator and the public SMART code round them
-first. The exception is `MapFeatures.polygon_rest`. `Scenario.origin` is in whole meters: subtracting it is exact.
+first. The exception is `MapFeatures.polygon_rest`. `Scenario.origin` is in whole meters: subtraction is exact.
 
-Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Nothing here
-needs torch.
+Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Torch is not
+needed.
 """
 
 import re
@@ -199,17 +199,17 @@ class MapFeatures:
         ids, types, lines = zip(*features) if (features := list(features)) else ((), (), ())
         lengths = np.array([len(line) for line in lines], np.int64)
         exact = np.concatenate([np.zeros((0, 3)), *lines])  # [P, 3] float64
-        points, rest = to_float32(exact), np.zeros_like(exact)
+        points, error = to_float32(exact), np.zeros_like(exact)
         # only of finite points: infinity minus infinity would warn before the point is refused by name
         is_polygon = np.repeat(np.isin(types, POLYGON_TYPES), lengths)[:, None]
-        np.subtract(exact, points, out=rest, where=is_polygon & np.isfinite(points))
+        np.subtract(exact, points, out=error, where=is_polygon & np.isfinite(points))
         return cls(
             feature_id=np.array(ids, np.int64),
             feature_type=np.array(types, np.int8),
             points=points,
             offsets=np.append(0, np.cumsum(lengths)),
             topology=topology or LaneTopology(),
-            polygon_rest=to_float32(rest) if has_polygon_rest else None,
+            polygon_rest=to_float32(error) if has_polygon_rest else None,
         )
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""The part of a network's map that belongs to one scenario."""
+"""The part of a network's map that belongs to a scenario."""
 
 from dataclasses import dataclass
 

@@ -19,7 +19,7 @@ from rlftsim.scenario.synthetic.street_plan import (
 
 @dataclass(frozen=True)
 class _Carriageway:
-    """One direction of a freeway: cuts along the arc and the properties that its segments share."""
+    """One direction of a freeway: cuts along the arc and the properties that all segments share."""
 
     name: str
     curvature: float

@@ -80,7 +80,7 @@ def _edges_xml(plan: StreetPlan) -> str:
 
 
 def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposites") -> Path:
-    """Write the plan as plain XML into `folder` and compile it.
+    """Write the plan as plain XML into `folder` and compile the network.
 
     Args:
         plan: Street plan with nodes, streets and connections.
