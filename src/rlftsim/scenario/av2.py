@@ -290,7 +290,7 @@ def _read_tracks(rows: Rows, num_steps: int, source: Av2Source, ground: Ground) 
         raise DataError(f"{rows.table}: track {names[track]} has two rows for timestep {timestep}")
     motion_columns = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
     motion = np.column_stack([rows[name] for name in motion_columns])  # [rows, 5]
-    is_impossible = ~(np.abs(motion) < 1e7).all(1)  # NaN, too
+    is_impossible = ~(np.abs(motion).max(1) < 1e7)  # NaN, too
     cause = "track {} has a NaN, infinite or impossible value at timestep {}"
     rows.check(is_impossible, cause, names[owner], step)
     labels = rows["object_type"][first_row]

@@ -90,7 +90,7 @@ class ShardWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)
             self._writer = pa.ipc.new_file(self._file, _SCHEMA)
-        self._pending: list[dict[str, object]] = []
+        self._pending: list[Mapping[str, object]] = []
 
     def add(self, scenario: Scenario, split: str, source_record: int | None = None) -> None:
         """Append a scenario.

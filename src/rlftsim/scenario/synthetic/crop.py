@@ -1,6 +1,7 @@
 """The part of a network's map that belongs to a scenario."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -31,20 +32,10 @@ class MapCropper:
 
     network_map: NetworkMap
     ground: Ground
-    points: Float[np.ndarray, "P 2"]
-    offsets: np.ndarray
 
-    @staticmethod
-    def of(network_map: NetworkMap, ground: Ground) -> "MapCropper":
-        """Cropper of a map.
-
-        Args:
-            network_map: Map of the whole network in plan coordinates.
-            ground: Ground that the points of the crop take heights from.
-        """
-        sizes = [len(feature.points) for feature in network_map.features]
-        points = np.concatenate([feature.points for feature in network_map.features])
-        return MapCropper(network_map, ground, points, np.append(0, np.cumsum(sizes)))
+    @cached_property
+    def _points(self) -> Float[np.ndarray, "P 2"]:
+        return np.concatenate([feature.points for feature in self.network_map.features])
 
     def crop(self, centers: Float[np.ndarray, "n 2"], radius_m: float) -> MapFeatures:
         """Features within a radius of any of the centers.
@@ -58,17 +49,17 @@ class MapCropper:
         """
         # 1. Points inside, for all features at once.
         # a running minimum: all distances at once would take 8 bytes times points times centers
-        nearest = np.full(len(self.points), np.inf)
+        nearest = np.full(len(self._points), np.inf)
         for center in centers:
-            np.minimum(nearest, ((self.points - center) ** 2).sum(axis=1), out=nearest)
+            np.minimum(nearest, ((self._points - center) ** 2).sum(axis=1), out=nearest)
         inside = nearest < radius_m**2  # [P]
         # 2. Stretches of each feature inside.
         network_map = self.network_map
         stretches: list[tuple[int, Feature, np.ndarray]] = []
         next_id = len(network_map.features) + 1
-        for index, feature in enumerate(network_map.features):
-            polylines = cut_feature(feature, inside[self.offsets[index] : self.offsets[index + 1]])
-            for number, polyline in enumerate(polylines):
+        borders = np.cumsum([len(feature.points) for feature in network_map.features])
+        for feature, inside_feature in zip(network_map.features, np.split(inside, borders)):
+            for number, polyline in enumerate(cut_feature(feature, inside_feature)):
                 stretches.append((feature.feature_id if number == 0 else next_id, feature, polyline))
                 next_id += number > 0
         # 3. Links between lanes that still meet: the end of the first and the start of the second are both in the crop.
@@ -99,8 +90,7 @@ class MapCropper:
             interpolating=np.array([feature.interpolating for feature in features], bool),
         )
         grid_points = np.column_stack([on_grid(points, MAP_GRID_PER_M), height])
-        ends_of_stretches = np.cumsum([len(polyline) for _, _, polyline in stretches])
-        lines = np.split(grid_points, ends_of_stretches)
+        lines = np.split(grid_points, np.cumsum([len(polyline) for _, _, polyline in stretches]))
         ids, types = [feature_id for feature_id, _, _ in stretches], [feature.feature_type for feature in features]
         return MapFeatures.of(zip(ids, types, lines), topology)
 

@@ -121,9 +121,8 @@ def draw_freeway_plan(rng: np.random.Generator) -> StreetPlan:
         turn = rotation_matrix(angle) * flip
         on, off = rng.uniform(-190, -130), rng.uniform(130, 190)
         cuts = (-470.0, on, on + rng.uniform(130, 170), off - rng.uniform(90, 120), off, 470.0)
-        carriageway = _Carriageway(
-            name, flip * curvature, cuts, int(rng.integers(3, 5)), width, median_half, speed, gutter, turn
-        )
+        lanes = int(rng.integers(3, 5))
+        carriageway = _Carriageway(name, flip * curvature, cuts, lanes, width, median_half, speed, gutter, turn)
         # a node at every cut; at both ends traffic enters and leaves
         for index, cut in enumerate(cuts):
             position = carriageway.inner_border(cut, cut + 1)[0]

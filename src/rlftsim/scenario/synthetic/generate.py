@@ -85,11 +85,9 @@ def plan_networks(request: SyntheticRequest) -> list[NetworkTask]:
         types = [NETWORK_TYPES[k % len(NETWORK_TYPES)] for k in range(count)]
         weights = np.array([0.5 if network_type == "freeway" else 1.0 for network_type in types])
         # cumulated and rounded, so that the numbers add up to the total
-        bounds = np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)
-        tasks += [
-            NetworkTask(split, k, types[k], int(bounds[k + 1] - bounds[k]), (request.seed, split_number, k))
-            for k in range(count)
-        ]
+        counts = np.diff(np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)).tolist()
+        for k, (network_type, num_scenarios) in enumerate(zip(types, counts)):
+            tasks.append(NetworkTask(split, k, network_type, num_scenarios, (request.seed, split_number, k)))
     return tasks
 
 

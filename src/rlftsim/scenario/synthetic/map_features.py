@@ -40,8 +40,6 @@ class NetworkMap:
     """All features of a network; ids are unique in it."""
 
     features: tuple[Feature, ...]
-    lane_ids: dict[str, int]
-    """Feature id of each compiled lane, of connectors by the first lane."""
     entry_exit: tuple[tuple[int, int], ...]
     """Lane and the lane that follows."""
     neighbors: tuple[tuple[int, int, int], ...]
@@ -278,7 +276,7 @@ def build_network_map(network: Network) -> NetworkMap:
     """All map features of a network, lanes first. Connectors at the network's ends (turn-arounds) are left out."""
     fringe = {node.node_id for node in network.plan.fringe_nodes}
     features: list[Feature] = []
-    lane_ids: dict[str, int] = {}
+    lane_ids: dict[str, int] = {}  # of compiled lanes, and of connectors by the first lane
 
     def _add(feature_type: MapFeatureType, points: np.ndarray, speed: float = 0.0, interpolating: bool = False) -> int:
         """Append a feature; its id counts from 1."""
@@ -293,7 +291,7 @@ def build_network_map(network: Network) -> NetworkMap:
     for connector in connectors:
         origin = network.lane(connector.from_lane)
         feature_type = MapFeatureType.LANE_BIKE if connector.is_bicycle else _lane_type(origin)
-        lane_ids[connector.lane_ids[0]] = _add(feature_type, resample(connector.shape), connector.speed_mps, True)
+        lane_ids[connector.lane_id] = _add(feature_type, resample(connector.shape), connector.speed_mps, True)
 
     # 2. Lines, edges, crosswalks, stop signs.
     area = compute_drivable_area(network)
@@ -311,7 +309,7 @@ def build_network_map(network: Network) -> NetworkMap:
     # 3. Links between lanes.
     entry_exit, neighbors = [], []
     for connector in connectors:
-        middle = lane_ids[connector.lane_ids[0]]
+        middle = lane_ids[connector.lane_id]
         entry_exit.append((lane_ids[network.lane(connector.from_lane).lane_id], middle))
         entry_exit.append((middle, lane_ids[network.lane(connector.to_lane).lane_id]))
     for lane in network.lanes.values():
@@ -321,10 +319,9 @@ def build_network_map(network: Network) -> NetworkMap:
             neighbor_id = f"{lane.street.street_id}_{lane.index + step}"
             if neighbor_id in lane_ids:
                 neighbors.append((lane_ids[lane.lane_id], side, lane_ids[neighbor_id]))
-    lights = [(c.light, c.link_index, lane_ids[c.lane_ids[0]], c.direction) for c in connectors if c.light is not None]
+    lights = [(c.light, c.link_index, lane_ids[c.lane_id], c.direction) for c in connectors if c.light is not None]
     return NetworkMap(
         features=tuple(features),
-        lane_ids=lane_ids,
         entry_exit=tuple(entry_exit),
         neighbors=tuple(neighbors),
         stop_sign_lanes=tuple(signs),

@@ -2,11 +2,13 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.synthetic.street_plan import Street, StreetPlan
 
 LaneKey = tuple[str, int]
@@ -28,6 +30,30 @@ class Lane:
     street: Street | None = None
     index: int = 0
 
+    @cached_property
+    def _distances(self) -> Float[np.ndarray, "n"]:
+        return arc_length(self.shape)
+
+    def points_at(self, positions_m: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
+        """Points on the center line.
+
+        Args:
+            positions_m: Positions of SUMO, m, along the nominal length, which differs from the length of the shape.
+        """
+        distances = positions_m * (self._distances[-1] / max(self.length_m, 1e-3))
+        return np.stack([np.interp(distances, self._distances, self.shape[:, k]) for k in range(2)], axis=1)
+
+    def directions_at(self, positions_m: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
+        """Unit tangents of the center line over one meter.
+
+        Args:
+            positions_m: Positions of SUMO along the nominal length, m, as in `points_at`.
+        """
+        reach = min(0.5, 0.4 * self.length_m)
+        middle = np.clip(positions_m, reach, max(self.length_m - reach, reach))
+        delta = self.points_at(middle + reach) - self.points_at(middle - reach)
+        return delta / np.maximum(np.linalg.norm(delta, axis=1, keepdims=True), 1e-9)
+
 
 @dataclass(frozen=True, eq=False)
 class Connector:
@@ -35,7 +61,8 @@ class Connector:
 
     from_lane: LaneKey
     to_lane: LaneKey
-    lane_ids: tuple[str, ...]
+    lane_id: str
+    """Id of the first internal lane."""
     shape: Float[np.ndarray, "n 2"]
     width_m: float
     speed_mps: float
@@ -95,13 +122,12 @@ def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> list[
         while onward[lane_ids[-1]].get("via"):
             lane_ids.append(onward[lane_ids[-1]].get("via", ""))
         goal = lanes[f"{row.get('to')}_{row.get('toLane')}"]
-        shape = join_shapes([lanes[lane_id].shape for lane_id in lane_ids])
         connectors.append(
             Connector(
                 from_lane=(origin.street.street_id, origin.index),
                 to_lane=(row.get("to", ""), int(row.get("toLane", 0))),
-                lane_ids=tuple(lane_ids),
-                shape=shape,
+                lane_id=lane_ids[0],
+                shape=join_shapes([lanes[lane_id].shape for lane_id in lane_ids]),
                 width_m=min(origin.width_m, goal.width_m),
                 speed_mps=lanes[lane_ids[0]].speed_mps,
                 is_bicycle="bicycle" in (origin.lane_type, goal.lane_type),
@@ -142,11 +168,9 @@ def read_network(path: Path, plan: StreetPlan) -> Network:
                 index=index,
             )
     # 2. Junctions and their crosswalks, whose lanes are named ":junction_number_0".
-    shapes = {
-        row.get("id", ""): _points(row.get("shape", ""))
-        for row in root.iter("junction")
-        if row.get("type") != "internal" and len(row.get("shape", "").split()) >= 3
-    }
+    junctions = [row for row in root.iter("junction") if row.get("type") != "internal"]
+    outlines = {row.get("id", ""): row.get("shape", "") for row in junctions}
+    shapes = {junction: _points(outline) for junction, outline in outlines.items() if len(outline.split()) >= 3}
     crossings = [lane for lane in lanes.values() if lane.lane_type == "crossing"]
     crosswalks = tuple((lane.lane_id[1:].rsplit("_", 2)[0], lane.shape, lane.width_m) for lane in crossings)
     return Network(

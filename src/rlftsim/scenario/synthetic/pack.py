@@ -4,5 +4,5 @@ from pathlib import Path
 
 
 def pack_path() -> Path:
-    """Folder of the embedded data set, with the splits "training" and "validation"; `ScenarioDataset` opens the folder."""
+    """Folder of the embedded data set, with the splits "training" and "validation"; `ScenarioDataset` opens it."""
     return Path(__file__).parent / "pack"

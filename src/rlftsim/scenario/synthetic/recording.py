@@ -1,12 +1,10 @@
 """SUMO's output files read back: bodies of all road users, states of all lights."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow.csv
-from jaxtyping import Float
 
 from rlftsim.scenario.synthetic.bodies import Body, BumperPath, build_pedestrian, build_vehicle
 from rlftsim.scenario.synthetic.demand import RoadUserType, draw_size
@@ -22,42 +20,6 @@ SMALLEST_JUMP_M = 0.3
 Lanes that follow one another may not quite meet: bicycles keep right in a car's lane.
 """
 LONGEST_EVALUATED_M = 7.0
-
-
-class _LaneRuler:
-    """Points and directions at SUMO's positions along lanes, with the lengths measured once."""
-
-    def __init__(self, lanes: dict[str, Lane]) -> None:
-        self._lanes = lanes
-        self._lengths: dict[str, np.ndarray] = {}
-
-    def points_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Points on a lane's center line.
-
-        Args:
-            lane_id: Id of a compiled lane.
-            positions_m: Positions of SUMO, m, along the lane's nominal length, which differs from the shape's length.
-        """
-        lane = self._lanes[lane_id]
-        if lane_id not in self._lengths:
-            steps = np.linalg.norm(np.diff(lane.shape, axis=0), axis=1)
-            self._lengths[lane_id] = np.append(0.0, np.cumsum(steps))
-        lengths = self._lengths[lane_id]
-        positions = positions_m * (lengths[-1] / max(lane.length_m, 1e-3))
-        return np.stack([np.interp(positions, lengths, lane.shape[:, k]) for k in range(2)], axis=1)
-
-    def directions_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Unit tangents of a lane's center line over one meter.
-
-        Args:
-            lane_id: Id of a compiled lane.
-            positions_m: Positions of SUMO along the nominal length, m, as in `points_at`.
-        """
-        length = self._lanes[lane_id].length_m
-        reach = min(0.5, 0.4 * length)
-        middle = np.clip(positions_m, reach, max(length - reach, reach))
-        delta = self.points_at(lane_id, middle + reach) - self.points_at(lane_id, middle - reach)
-        return delta / np.maximum(np.linalg.norm(delta, axis=1, keepdims=True), 1e-9)
 
 
 def _read_table(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray] | None:
@@ -78,7 +40,7 @@ def _runs_by_id(ids: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
     return [run for run in np.split(order, np.flatnonzero(new) + 1) if len(run) >= MIN_STEPS]
 
 
-def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> BumperPath:
+def _lane_path(lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> BumperPath:
     """Bumper of a vehicle along lane centers, with the jumps between neighboring lanes listed as lane changes."""
     lane_ids, positions = rows["vehicle_lane"], rows["vehicle_pos"]
     center = np.empty((len(lane_ids), 2))
@@ -86,16 +48,15 @@ def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.nda
     starts = np.append(0, np.flatnonzero(lane_ids[1:] != lane_ids[:-1]) + 1)
     changes, distances = [], []
     for start, stop in zip(starts, np.append(starts[1:], len(lane_ids)), strict=True):
-        lane_id = str(lane_ids[start])
-        center[start:stop] = ruler.points_at(lane_id, positions[start:stop])
-        direction[start:stop] = ruler.directions_at(lane_id, positions[start:stop])
-        last_lane = lanes[str(lane_ids[start - 1])] if start else None
-        lane = lanes[lane_id]
-        if last_lane is None:
+        lane = lanes[str(lane_ids[start])]
+        center[start:stop] = lane.points_at(positions[start:stop])
+        direction[start:stop] = lane.directions_at(positions[start:stop])
+        if start == 0:
             continue
+        last_lane = lanes[str(lane_ids[start - 1])]
         # Side by side, the jump is measured at one position; through a junction the two lanes have none in common.
         if last_lane.street is not None and last_lane.street is lane.street:
-            jump = center[start] - ruler.points_at(last_lane.lane_id, positions[start : start + 1])[0]
+            jump = center[start] - last_lane.points_at(positions[start : start + 1])[0]
         else:
             jump = center[start] - center[start - 1]
         left_m = float(jump @ np.array([-direction[start, 1], direction[start, 0]]))
@@ -121,18 +82,16 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
     is_on_lane = np.array([lane in network.lanes for lane in table["vehicle_lane"]])
     table = {name: column[is_on_lane] for name, column in table.items()}
     step = np.rint((table["timestep_time"] - DISCARDED_S) / STEP_S).astype(int)
-    ruler = _LaneRuler(network.lanes)
     bodies = []
     for run in _runs_by_id(table["vehicle_id"], step):
         user_type = types[str(table["vehicle_type"][run[0]])]
-        lane_path = _lane_path(ruler, network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
+        lane_path = _lane_path(network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
         # a type has one size for SUMO; heights may differ, because SUMO does not know them
         height = user_type.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
         habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))
         size = (user_type.length_m, user_type.width_m, height)
-        bodies.append(
-            build_vehicle(lane_path, user_type.object_type, size, habit, user_type.length_m <= LONGEST_EVALUATED_M)
-        )
+        is_evaluable = user_type.length_m <= LONGEST_EVALUATED_M
+        bodies.append(build_vehicle(lane_path, user_type.object_type, size, habit, is_evaluable))
     return bodies
 
 
@@ -160,24 +119,11 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
-@dataclass(frozen=True, eq=False)
-class SignalStates:
-    """SUMO's letters of all links of a junction, a string per simulated step."""
-
-    junction: str
-    states: tuple[str, ...]
-
-    def has_protected_phase(self, link_index: int) -> bool:
-        """True if the link may go with right of way (G) in a phase, and without (g) in a different phase."""
-        return {"G", "g"} <= {state[link_index] for state in self.states}
-
-
-def read_signals(path: Path, junction: str) -> SignalStates:
-    """Signal states of a junction from the first simulated step on.
+def read_signals(path: Path) -> tuple[str, ...]:
+    """Letters of SUMO for all links of a junction, a text per simulated step from the first on.
 
     Args:
         path: File with the junction's signal states, XML of SUMO.
-        junction: Id of the junction in the compiled network.
     """
     entries = re.findall(r'time="([\d.]+)"[^>]*state="([^"]*)"', path.read_text())
-    return SignalStates(junction, tuple(state for time, state in entries if float(time) >= DISCARDED_S - 1e-6))
+    return tuple(state for time, state in entries if float(time) >= DISCARDED_S - 1e-6)

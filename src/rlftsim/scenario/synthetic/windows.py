@@ -18,7 +18,6 @@ from rlftsim.scenario.synthetic.gates import (
     compute_overlap_s,
     moves_plausibly,
 )
-from rlftsim.scenario.synthetic.recording import SignalStates
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     STEP_S,
@@ -60,7 +59,8 @@ class World:
     name: str
     bodies: tuple[Body, ...]
     cropper: MapCropper
-    signals: dict[str, SignalStates]
+    signals: dict[str, tuple[str, ...]]
+    """Letters of SUMO for all links of each junction, a text per step."""
     ends: Float[np.ndarray, "n 2"]
     """Positions of the network's ends."""
     num_steps: int
@@ -204,13 +204,13 @@ def _observe_lights(
             continue
         if np.linalg.norm(ego_path - stop, axis=1).min() < range_m:
             # a left turn that has a phase of its own is shown by arrows
-            arrow = direction in "lL" and world.signals[junction].has_protected_phase(link)
+            arrow = direction in "lL" and {"G", "g"} <= {state[link] for state in world.signals[junction]}
             lights.append((junction, link, lane_id, stop_point, arrow))
     # 2. Their states, step by step.
     rows = []
     for step in range(TOTAL_STEPS):
         for junction, link, lane_id, stop, arrow in lights:
-            letter = world.signals[junction].states[start + step][link]
+            letter = world.signals[junction][start + step][link]
             rows.append((step, lane_id, _LIGHT_STATES.get(letter, _STOP)[arrow], *stop))
     return LightStates.of(rows)
 

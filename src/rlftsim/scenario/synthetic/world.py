@@ -47,10 +47,7 @@ def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> Wo
     sumo_seed = int(rng.integers(1, 2**31 - 1))
     routes = sumo.route_demand(network_file, folder / "demand.xml", sumo_seed)
     signal_files = {junction: folder / f"signals_{junction}.xml" for junction in network.lights}
-    events = [
-        f'<timedEvent type="SaveTLSStates" source="{junction}" dest="{path}"/>'
-        for junction, path in signal_files.items()
-    ]
+    events = [f'<timedEvent type="SaveTLSStates" source="{k}" dest="{path}"/>' for k, path in signal_files.items()]
     additional = folder / "additional.xml"
     additional.write_text("\n".join(["<additional>", *events, "</additional>"]))
     vehicles_file, persons_file = sumo.simulate(network_file, routes, additional, sumo_seed)
@@ -64,8 +61,8 @@ def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> Wo
     return World(
         name="/".join(map(str, seed)),
         bodies=tuple(bodies),
-        cropper=MapCropper.of(network_map, draw_ground(rng)),
-        signals={junction: read_signals(path, junction) for junction, path in signal_files.items()},
+        cropper=MapCropper(network_map, draw_ground(rng)),
+        signals={junction: read_signals(path) for junction, path in signal_files.items()},
         ends=np.stack([node.position for node in plan.fringe_nodes]),
         num_steps=_NUM_STEPS,
     )
