@@ -336,8 +336,7 @@ def _convert_unit(
         bytes_left -= num_bytes
         advance(num_bytes)
 
-    writer = ShardWriter(task.folder / task.shard)
-    try:
+    with ShardWriter(task.folder / task.shard) as writer:
         scenarios = read_unit(
             source,
             task.unit,
@@ -350,10 +349,6 @@ def _convert_unit(
             writer.add(scenario, task.split, record)
             if is_stopped():
                 raise _Stopped
-        writer.close()
-    except BaseException:
-        writer.discard()
-        raise
     # bytes between records, and all of them for a source that does not count
     advance(bytes_left)
 

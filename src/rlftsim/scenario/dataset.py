@@ -19,9 +19,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
+from itertools import groupby
 from pathlib import Path, PurePosixPath
 from threading import Lock
-from types import TracebackType
 from typing import Any, overload
 
 import numpy as np
@@ -250,101 +250,6 @@ class ScenarioDataset:
         return self[self._position[scenario_id]]
 
 
-class DatasetWriter:
-    """Writes a new data set, as a context manager.
-
-    The complete folder appears when the block ends without an error.
-
-    Args:
-        folder: Folder of the data set, which must not exist or be empty.
-        scenarios_per_shard: Number of scenarios in a shard; smaller shards are fetched and read faster.
-        license_note: License of the data, for the manifest.
-        provenance: Origin of the data in plain JSON values, for the manifest.
-
-    Raises:
-        DataError: The folder is not empty, or cannot be written to.
-    """
-
-    def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        scenarios_per_shard: int = 256,
-        license_note: str = DEFAULT_LICENSE_NOTE,
-        provenance: Mapping[str, object] | None = None,
-    ) -> None:
-        self.folder = validate_folder(folder)
-        check_folder(self.folder, "data set")
-        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
-        # beside the folder, so that renaming it never crosses file systems
-        self._temporary = self.folder.absolute().with_name(f".{self.folder.name}.{os.getpid()}.tmp")
-        self._scenarios_per_shard = scenarios_per_shard
-        self._license_note = license_note
-        self._provenance = dict(provenance or {})
-        self._entries: list[ShardEntry] = []
-        self._ids: set[str] = set()
-        self._shard: ShardWriter | None = None
-        shutil.rmtree(self._temporary, ignore_errors=True)
-        with errors_name(self.folder):
-            (self._temporary / SHARDS).mkdir(parents=True)
-
-    def __enter__(self) -> "DatasetWriter":
-        return self
-
-    def __exit__(
-        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            if error_type is None:
-                self.close()
-        finally:
-            self.discard()  # after `close` there is nothing left to discard
-
-    def add(self, scenario: Scenario, split: str = "unknown") -> None:
-        """Append a scenario.
-
-        Args:
-            scenario: Scenario with a new id, whose valid states and map points are finite.
-            split: Name of the scenario's split, such as "training".
-
-        Raises:
-            DataError: The id is in the data set already, or `ShardWriter.add` refuses the scenario.
-        """
-        if scenario.scenario_id in self._ids:
-            raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
-        if self._shard is None:
-            self._shard = ShardWriter(self._temporary / SHARDS / f"{len(self._entries):05d}.arrow")
-        self._shard.add(scenario, split)
-        self._ids.add(scenario.scenario_id)
-        if self._shard.num_rows == self._scenarios_per_shard:
-            self._finish_shard()
-
-    def close(self) -> Manifest:
-        """Write index and manifest and give the folder the final name."""
-        self._finish_shard()
-        manifest = write_index_and_manifest(
-            self._temporary, self._entries, license_note=self._license_note, provenance=self._provenance
-        )
-        # the complete folder is renamed, so no reader ever sees half a data set
-        if self.folder.exists():
-            self.folder.rmdir()
-        os.replace(self._temporary, self.folder)
-        return manifest
-
-    def discard(self) -> None:
-        """Throw away the files written so far."""
-        if self._shard is not None:
-            self._shard.discard()
-        shutil.rmtree(self._temporary, ignore_errors=True)
-
-    def _finish_shard(self) -> None:
-        if self._shard is not None:
-            self._shard.close()
-            self._entries.append(describe_shard(self._temporary, self._shard.path, self._shard.num_rows))
-            self._shard = None
-
-
 def write_dataset(
     scenarios: Scenario | Iterable[Scenario],
     folder: str | os.PathLike[str],
@@ -352,6 +257,7 @@ def write_dataset(
     split: str | Callable[[Scenario], str] = "unknown",
     license_note: str = DEFAULT_LICENSE_NOTE,
     provenance: Mapping[str, object] | None = None,
+    scenarios_per_shard: int = 256,
 ) -> Manifest:
     """Write `scenarios` as a new data set.
 
@@ -361,6 +267,7 @@ def write_dataset(
         split: Name of the split of all scenarios, or a function from scenario to split.
         license_note: License of the data, for the manifest.
         provenance: Origin of the data in plain JSON values, for the manifest.
+        scenarios_per_shard: Number of scenarios in a shard; smaller shards are fetched and read faster.
 
     Returns:
         The manifest written.
@@ -371,16 +278,45 @@ def write_dataset(
             dtype than `types.py` says, a valid state or map point is not finite (names scenario, agent and step), an
             object id occurs twice, a type is unknown, a size is not above zero, or the ego is no track.
     """
-    with DatasetWriter(folder, license_note=license_note, provenance=provenance) as writer:
-        is_empty = True
-        for scenario in [scenarios] if isinstance(scenarios, Scenario) else scenarios:
-            is_empty = False
-            if not isinstance(scenario, Scenario):
-                raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
-            writer.add(scenario, split(scenario) if callable(split) else split)
-        if is_empty:
+    folder = validate_folder(folder)
+    check_folder(folder, "data set")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(f"{folder} is not an empty folder: choose another one or delete it")
+    # beside the folder, so that renaming it never crosses file systems
+    temporary = folder.absolute().with_name(f".{folder.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        with errors_name(folder):
+            (temporary / SHARDS).mkdir(parents=True)
+        scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
+        entries = _write_shards(temporary, scenarios, split, scenarios_per_shard)
+        if not entries:
             raise ConfigError(f"no scenario to write to {folder}: hand over at least one.")
+        write_index_and_manifest(temporary, entries, license_note=license_note, provenance=provenance)
+        # the complete folder is renamed, so no reader ever sees half a data set
+        if folder.exists():
+            folder.rmdir()
+        os.replace(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)  # still there after an error alone
     return read_manifest(folder)
+
+
+def _write_shards(
+    folder: Path, scenarios: Iterable[Scenario], split: str | Callable[[Scenario], str], scenarios_per_shard: int
+) -> list[ShardEntry]:
+    entries, ids = [], set()
+    for shard, numbered in groupby(enumerate(scenarios), lambda pair: pair[0] // scenarios_per_shard):
+        with ShardWriter(folder / SHARDS / f"{shard:05d}.arrow") as writer:
+            for _, scenario in numbered:
+                if not isinstance(scenario, Scenario):
+                    raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
+                if scenario.scenario_id in ids:
+                    raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
+                writer.add(scenario, split(scenario) if callable(split) else split)
+                ids.add(scenario.scenario_id)
+        entries.append(describe_shard(folder, writer.path, writer.num_rows))
+    return entries
 
 
 def dataset_folder(name: str | os.PathLike[str]) -> Path:

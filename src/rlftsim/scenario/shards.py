@@ -75,6 +75,8 @@ _SCHEMA = pa.schema(
 class ShardWriter:
     """Writes a shard under a temporary name until `close`; a shard that is not closed never gets the final name.
 
+    As a context manager the shard is closed at the end of the block, and discarded after an error.
+
     Args:
         path: Shard file to write; `close` replaces an existing file.
 
@@ -91,6 +93,16 @@ class ShardWriter:
             self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)
             self._writer = pa.ipc.new_file(self._file, _SCHEMA)
         self._pending: list[Mapping[str, object]] = []
+
+    def __enter__(self) -> "ShardWriter":
+        return self
+
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+        try:
+            if error_type is None:
+                self.close()
+        finally:
+            self.discard()  # after `close` no file is left
 
     def add(self, scenario: Scenario, split: str, source_record: int | None = None) -> None:
         """Append a scenario.

@@ -202,12 +202,7 @@ def _write_shard(folder: Path, task: NetworkTask, advance: Advance, is_stopped: 
     """Write the scenarios of a task, unless the run is being stopped."""
     if is_stopped():
         return
-    writer = ShardWriter(folder / task.shard_name)
-    try:
+    with ShardWriter(folder / task.shard_name) as writer:
         for scenario in generate_scenarios(task):
             writer.add(scenario, task.split)
-    except BaseException:
-        writer.discard()
-        raise
-    writer.close()
     advance(task.num_scenarios)
