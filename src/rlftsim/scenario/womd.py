@@ -85,24 +85,8 @@ def read_scenarios(
         DataError: No such file; under "stop" also a bad record: the message names file, record and cause.
     """
     for path in find_tfrecords(source):
-        for _, scenario in read_scenario_file(path, on_error=on_error, report=report):
+        for _, scenario in read_unit(WomdSource(), Unit(str(path), (path,)), on_error=on_error, report=report):
             yield scenario
-
-
-def read_scenario_file(
-    path: str | os.PathLike[str], *, on_error: OnError = "stop", report: Callable[[SkippedRecord], None] = log_skipped
-) -> Iterator[tuple[int, Scenario]]:
-    """Read a tfrecord file; yields the number of each record, from 0, with the scenario.
-
-    Args:
-        path: File with TFRecord framing, of any name.
-        on_error: "stop" raises at the first bad record, "skip" reports the damage and goes on.
-        report: Function called with each skipped record, only under "skip".
-
-    Raises:
-        DataError: No such file; under "stop" also a bad record: the message names file, record and cause.
-    """
-    return read_unit(WomdSource(), Unit(str(path), (Path(path),)), on_error=on_error, report=report)
 
 
 class WomdSource:

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.errors import ConfigError
 from rlftsim.scenario.polylines import arc_length, find_runs, resample_to
 from rlftsim.scenario.synthetic.network import Connector, Lane, Network
 from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
-from rlftsim.scenario.synthetic.sumo import INSTALL_HINT
 from rlftsim.scenario.types import MapFeatureType
 
 POINT_SPACING_M = 0.5
@@ -61,20 +59,13 @@ def resample(points: Float[np.ndarray, "n 2"], spacing_m: float = POINT_SPACING_
     return resample_to(points, int(np.ceil(arc_length(points)[-1] / spacing_m)) + 1)
 
 
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError as error:
-        raise ConfigError(INSTALL_HINT) from error
-    return shapely
-
-
 # --- drivable area ------------------------------------------------------------------------------------------------
 
 
 def _strip(shape: Float[np.ndarray, "n 2"], left_m: float, right_m: float) -> Any:
     """Polygon between two offsets of a polyline (meters to the left, meters to the right)."""
-    shapely = _shapely()
+    import shapely
+
     points = resample(shape, 2.0)
     ring = np.concatenate([offset_polyline(points, left_m), offset_polyline(points, -right_m)[::-1]])
     return shapely.Polygon(ring).buffer(0)
@@ -108,7 +99,8 @@ def _mouth(network: Network, street: Street, node_id: str) -> Any:
 
 def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> Any:
     """Connectors and crosswalks with rounded curbs, cut to the neighborhood of the junction."""
-    shapely = _shapely()
+    import shapely
+
     shape = shapely.Polygon(network.junction_shapes[node_id]).buffer(0)
     # streets count up to 14 m before the junction, far enough to round the corners between them
     surroundings = shape.buffer(14.0)
@@ -127,7 +119,8 @@ def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> An
 
 def compute_drivable_area(network: Network) -> Any:
     """Union of the streets' strips and the junctions, as a shapely geometry in plan coordinates."""
-    shapely = _shapely()
+    import shapely
+
     strips = _street_strips(network)
     fringe = {node.node_id for node in network.plan.fringe_nodes}
     areas = list(strips.values()) + [shapely.Polygon(taper) for taper in network.plan.tapers]
@@ -151,7 +144,8 @@ def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:
     Returns:
         Closed rings (first point repeated at the end) and whether each is a median, a thin hole.
     """
-    shapely = _shapely()
+    import shapely
+
     rings = []
     for polygon in getattr(area, "geoms", [area]):
         # WOMD's convention, which the metric relies on: the road is to the left of a road edge

@@ -30,7 +30,7 @@ def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> Wo
         folder: Existing folder for SUMO's files; the caller deletes the files.
 
     Raises:
-        ConfigError: SUMO or shapely is not installed.
+        ConfigError: SUMO is not installed.
         RlftsimError: A program of SUMO failed.
     """
     # One generator for all steps: the order of steps is part of a seed's meaning.
