@@ -502,6 +502,10 @@ EDITS = {
     "a seed in letters": (lambda table: with_settings(table, seed="one"), "seed must be a whole number, got 'one'"),
     "no column of ids": (lambda table: table.drop_columns(["scenario_id"]), "it lacks column scenario_id"),
     "no column of a score": (lambda table: table.drop_columns(["comfort"]), "it lacks column comfort"),
+    "a score that is no score": (
+        lambda table: table.set_column(2, "nuplan_style", pa.array([1e200])),
+        "column nuplan_style has a number beyond 1e+07",
+    ),
     "a score in letters": (
         lambda table: table.set_column(2, "nuplan_style", pa.array(["high"])),
         "column nuplan_style has empty cells or those of another type",

@@ -1,4 +1,6 @@
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pyarrow as pa
@@ -30,6 +32,28 @@ def test_text_that_is_no_utf8_is_refused_in_both_formats(tmp_path):
         read_parquet(tmp_path / "a.parquet", "write it again")
     with pytest.raises(DataError, match=r"is damaged \(.*Invalid UTF8.*: write it again\.$"):
         map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
+
+
+READ_DAMAGED = """
+import sys
+from pathlib import Path
+from rlftsim.errors import DataError
+from rlftsim.jobs.tables import read_parquet
+
+whole, damaged = Path(sys.argv[1]).read_bytes(), Path(sys.argv[2])
+for position in range(4, len(whole)):
+    damaged.write_bytes(whole[:position] + bytes([whole[position] ^ 0x13]) + whole[position + 1 :])
+    try:
+        read_parquet(damaged, "write it again")
+    except DataError:
+        pass
+"""
+
+
+def test_no_damaged_byte_of_a_parquet_file_ends_the_process(tmp_path):
+    pq.write_table(pa.table({"a": ["x", "y"], "b": ["z", "z"], "c": [1, 2]}), tmp_path / "a.parquet")
+    command = [sys.executable, "-c", READ_DAMAGED, str(tmp_path / "a.parquet"), str(tmp_path / "damaged.parquet")]
+    subprocess.run(command, check=True)
 
 
 def test_a_column_twice_is_refused(tmp_path):

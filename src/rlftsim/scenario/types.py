@@ -488,6 +488,8 @@ def _check_shapes(table: Any, name: str) -> None:
 
 def _check_time_base(timestamps_s: Float[np.ndarray, "t"], num_steps: int) -> None:
     """Check that timestamps are 0.1 s apart: else speeds, tokens and scores would be wrong by a factor."""
+    if np.ndim(timestamps_s) != 1:
+        raise DataError(f"timestamps are {in_short(timestamps_s)}, not one number for each step")
     if len(timestamps_s) != num_steps:
         raise DataError(f"{len(timestamps_s)} timestamps for {num_steps} steps")
     offset_s = timestamps_s - timestamps_s[0]

@@ -113,8 +113,8 @@ def augment_goals(
         Number of scenarios that have goals now.
 
     Raises:
-        DataError: A scenario withholds the future, or another driver is at work in the folder.
-        CheckpointError: The folder holds goals of another policy, other scenarios or other settings.
+        DataError: A scenario withholds the future, or a second driver is at work in the folder.
+        CheckpointError: The folder holds goals of a different policy, other scenarios or other settings.
         ConfigError: `top_k` is set and the policy's decisions are not categories.
         SetAside, Unfinished: See `run_items`.
     """
