@@ -13,7 +13,7 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.mirror import mirrored
+from rlftsim.scenario.mirror import mirror_scenario
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
 
 MIN_FUTURE_STEPS = 5
@@ -38,7 +38,7 @@ def batch_with_futures(
     Raises:
         DataError: a scenario withholds the future, so the model cannot learn from the scenario.
     """
-    selected = [mirrored(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
+    selected = [mirror_scenario(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
     for scenario in selected:
         if not scenario.has_future:
             raise DataError(

@@ -27,7 +27,7 @@ from rlftsim.rollout.types import RolloutProvenance, Rollouts
 from rlftsim.scenario.any_form import to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_splits, open_dataset
+from rlftsim.scenario.open import check_membership, open_dataset
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goal_outcomes import read_rollouts, report_outcomes
@@ -242,7 +242,7 @@ def _simulate_files(
     ids = list(dict.fromkeys(scenario or file.scenario_ids or scenarios.scenario_ids))[:limit]
     for scenario_id in ids:
         entries = file.of_scenario(scenario_id)
-        check_splits(scenarios, scenario_id, name, "--scenario" if scenario else next(iter(entries), ""))
+        check_membership(scenarios, scenario_id, name, "--scenario" if scenario else next(iter(entries), ""))
         if entries:
             warn_of_doubts(entries, scenarios.by_id(scenario_id))
         elif file.goals:
