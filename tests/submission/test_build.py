@@ -180,7 +180,7 @@ def test_only_the_files_of_the_build_are_removed(data, tmp_path):
     for path in mine:
         path.write_text("of a user")
     build(data, tmp_path, is_deleting=True)
-    is_deleting(entries.make_job(data, tmp_path, num_shards=NUM_SHARDS))
+    delete_shards(entries.make_job(data, tmp_path, num_shards=NUM_SHARDS))
     assert sorted((tmp_path / "shards").iterdir()) == sorted(mine)
 
 

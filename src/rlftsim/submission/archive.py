@@ -243,10 +243,9 @@ class GzipReader:
             pass
         remainder = self._inflate.unused_data + self._read_packed()
         if remainder:
-            finding = "another gzip member" if remainder[:2] == _GZIP_HEADER[:2] else "other bytes"
-            raise DataError(
-                f"{finding} behind the first gzip member: Python's tarfile reads the first one only, pack it again as one"
-            )
+            surplus = "another gzip member" if remainder[:2] == _GZIP_HEADER[:2] else "other bytes"
+            way_out = "Python's tarfile reads the first one only, pack it again as one"
+            raise DataError(f"{surplus} behind the first gzip member: {way_out}")
 
     def read_to_end(self) -> None:
         """Read the remaining bytes of the file, of any content, for the checksum."""

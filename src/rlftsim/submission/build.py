@@ -103,7 +103,7 @@ class _Receipts(ResultFormat[int, PackedShard]):
 def build_archive(
     job: Job, *, runner: Runner | None = None, is_deleting: bool = False, show_progress: bool = True
 ) -> Path:
-    """Simulate the missing shards, write the archive and return the path. Interrupted in any way, the same call goes on.
+    """Simulate the missing shards, write the archive and return the path. After an interruption the same call goes on.
 
     Args:
         job: Policy, data, plan and settings of the submission.

@@ -24,12 +24,12 @@ def statement(policy: Policy, sampling: Sampling) -> str:
         sampling: Temperature and truncation of the submitted rollouts, quoted in the statement.
     """
     stride = policy.steps_per_decision
-    truncation = "" if sampling.top_k is None else f", top {sampling.top_k}"
+    limit = "" if sampling.top_k is None else f", top {sampling.top_k}"
     return f"""The challenge takes outputs of "individual next-state prediction inference calls", each conditioned on
 the preceding states, made at least once a second. The ego's next state must be independent of the others'
 given the past. How these rollouts are made:
 * the policy decides every {stride * STEP_S:g} s, {FUTURE_STEPS // stride} times in 8 s, from the states so far;
-* every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{truncation});
+* every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{limit});
 * it sees the log up to the current step only: no future, no goals;
 * nothing drawn at the start of a rollout is shared by the ego and other agents;
 * every rollout that is drawn is submitted: none is selected, repaired or drawn again by its outcome.
