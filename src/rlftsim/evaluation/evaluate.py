@@ -1,4 +1,4 @@
-"""Scores of a policy on a data set: simulate every scenario, score all its rollouts together, keep the numbers of each.
+"""Scores of a policy on a data set: simulate every scenario, score all rollouts together, keep a row per scenario.
 
 An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
 """
@@ -20,7 +20,7 @@ from rlftsim.evaluation.results import (
     NUMBERS_VERSION,
     EvaluateConfig,
     Evaluation,
-    GoalsGiven,
+    GoalChoice,
     Provenance,
     Skipped,
     row_of_result,
@@ -43,7 +43,7 @@ from rlftsim.scenario.types import Scenario
 __all__ = [
     "EvaluateConfig",
     "Evaluation",
-    "GoalsGiven",
+    "GoalChoice",
     "Provenance",
     "Skipped",
     "evaluate",
@@ -67,7 +67,7 @@ def evaluate(
 ) -> Evaluation:
     """Score a policy on the scenarios of a data set; the result is also written to `out/<name>.parquet`.
 
-    Interrupted in any way, the same call goes on; once finished, it reads the result.
+    Interrupted in any way, the same call goes on; a finished result is read.
 
     Args:
         policy: Any policy, or "oracle" for the log.
@@ -120,23 +120,23 @@ def evaluate(
 
 
 def evaluation_name(model: str | PathLike[str]) -> str:
-    """Name of an evaluation of a model: that of its folder, or of its run, as a run's model lies in RUN/model."""
+    """Name of an evaluation of a model: name of the folder, or of the run for a model in RUN/model."""
     path = Path(model)
     return path.parent.name if path.name == "model" else path.name
 
 
 def frozen_copy(policy: AnyPolicy) -> AnyPolicy:
-    """A copy without dropout and gradients, so that a policy may keep parts of it in tables; itself without weights."""
+    """A copy without dropout and gradients, so that tables of weights stay valid; the policy if without weights."""
     return copy.deepcopy(policy).eval().requires_grad_(False) if isinstance(policy, nn.Module) else policy
 
 
 def evaluated_ends(batch: ScenarioBatch) -> Goals:
-    """Logged final positions of the evaluated agents, as their goals."""
+    """Logged final positions of the evaluated agents, as goals."""
     return logged_goals(batch, batch.evaluated_mask)
 
 
 def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
-    """Plain values that a stored measurement must agree with to be this one, for `ScenarioValues`.
+    """Plain values that identify a measurement, for the comparison with stored files of `ScenarioValues`.
 
     Args:
         policy: Policy that is measured; weights and settings count.
@@ -160,7 +160,7 @@ def check_jobs(jobs: int, device: torch.device, setting: str = "evaluate.jobs") 
         setting: Name of the setting, for messages.
 
     Raises:
-        ConfigError: No process, or several and another device.
+        ConfigError: No process, or several processes and a GPU.
     """
     whole_number(setting, jobs, 1)
     if jobs > 1 and device.type != "cpu":
@@ -177,13 +177,13 @@ def simulate_states(
     *,
     goals_of: Callable[[ScenarioBatch], Goals] | None = None,
 ) -> SimulatedStates:
-    """All rollouts of one scenario, simulated a few at a time; a deterministic policy is simulated once.
+    """All rollouts of a scenario, simulated a few at a time; a deterministic policy is simulated once.
 
     Args:
         policy: Policy of all agents.
         scenario: Logged scenario, simulated from the current step on.
         config: Number of rollouts, rollouts at a time, seed, sampling.
-        device: Device on which the policy is, and on which all is computed.
+        device: Device of the policy, for all computations.
         goals_of: Goals of the agents of a batch, the same in all rollouts; None = goal-free.
 
     Raises:
@@ -199,7 +199,7 @@ def simulate_states(
 def simulate_encoded(
     policy: Policy, batch: ScenarioBatch, context: Any, config: EvaluateConfig, *, goals: Goals | None = None
 ) -> SimulatedStates:
-    """All rollouts of one scenario that the policy has encoded, see `simulate_states`.
+    """All rollouts of a scenario that the policy has encoded, see `simulate_states`.
 
     Args:
         policy: Policy of all agents.
@@ -237,7 +237,7 @@ def simulate_encoded(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
+    """Input of the work on a scenario; is handed to worker processes."""
 
     policy: Policy | Oracle
     dataset: ScenarioDataset
@@ -245,7 +245,7 @@ class _Job:
 
 
 def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
-    """Row of one scenario, or why there is none."""
+    """Row of a scenario, or the reason for a missing row."""
     scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
         scenario.check_consistency()

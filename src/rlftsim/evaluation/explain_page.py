@@ -1,4 +1,4 @@
-"""Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms behind."""
+"""Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms."""
 
 import hashlib
 from collections.abc import Callable
@@ -73,7 +73,7 @@ def explain_rollouts(
     """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
 
     Further sets of rollouts of the same scenario are numbered: `<scenario id>-2.html`. Until all pages are there, the
-    finished ones lie in a folder of their own inside `out`: interrupted in any way, the same call goes on.
+    finished pages lie in a separate folder inside `out`: interrupted in any way, the same call goes on.
 
     Args:
         rollouts: Npz, submission file or a folder of either, see `find_rollouts`.
@@ -118,7 +118,7 @@ def _write_page(
     advance: Advance,
     is_stopped: Callable[[], bool],
 ) -> None:
-    """Write a page, empty where there is nothing to explain, unless the work is being stopped."""
+    """Write a page, empty for a scenario without a score, unless the work is being stopped."""
     if is_stopped():
         return
     name, entry = item
@@ -132,7 +132,7 @@ def _write_page(
 
 
 def explanation_html(explanation: Explanation) -> str:
-    """The whole page."""
+    """The page of an explanation as HTML."""
     name, result = explanation.scenario.scenario_id, explanation.result
     metric = escape(explanation.config.name)
     lead = (
@@ -300,7 +300,7 @@ def _table_html(head: str, rows: list[str]) -> str:
 
 
 def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:
-    """A cost, the redder the larger it is among others; green where it is a gain."""
+    """A cost, the redder the larger among all costs; green for a gain."""
     if not np.isfinite(value):
         return "<td>none scored</td>"
     heat = abs(value) / max(float(np.nanmax(np.abs(among))), 1e-12)

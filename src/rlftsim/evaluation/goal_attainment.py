@@ -1,6 +1,6 @@
-"""Attainment of goals that are given one at a time: the fraction of a policy's rollouts that come to each goal.
+"""Attainment of single goals: the fraction of a policy's rollouts that come to each goal.
 
-A file per scenario is kept, with the policy's fingerprint: an interrupted measurement is resumed, and another policy is
+A file per scenario is stored, with the policy's fingerprint: an interrupted measurement is resumed, and a new policy is
 measured anew. A policy that is not goal-conditioned is measured against the same goals, as a baseline.
 """
 
@@ -28,7 +28,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 
 @dataclass(frozen=True)
 class Attained:
-    """Attainment of one goal: fractions of the rollouts."""
+    """Attainment of a goal: fractions of the rollouts."""
 
     entry: GoalEntry
     reached: float
@@ -38,12 +38,12 @@ class Attained:
 
     @property
     def reached_once(self) -> float:
-        """1 if some rollout reaches it, else 0."""
+        """1 if any rollout reaches the goal, else 0."""
         return float(self.reached > 0)
 
     @property
     def passed_once(self) -> float:
-        """1 if some rollout passes it, else 0."""
+        """1 if any rollout passes the goal, else 0."""
         return float(self.passed > 0)
 
 
@@ -60,16 +60,16 @@ def attain_goals(
     """Attainment of each goal by a policy, in the order of the goals.
 
     Args:
-        policy: Any policy; one that is not goal-conditioned is simulated once for all goals of a scenario.
+        policy: Any policy; without goal conditioning, a scenario is simulated once for all goals.
         data: Folder of a data set, "synthetic", or an opened data set.
         out: Folder of the results, a JSON file per scenario, made if missing.
         config: Rollouts, seed, sampling, split, processes.
-        goals: Goals, each of which is pursued alone, whatever other goals the scenario has.
+        goals: Goals; each is pursued alone, whatever goals the scenario has besides.
         title: Name of the work, in front of the progress bar.
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: No such data set, scenario or agent, or another process at work in the folder.
+        DataError: No such data set, scenario or agent, or a second process at work in the folder.
         ConfigError: Several processes for a policy on a GPU.
     """
     dataset, config = open_held_out(data, config)
@@ -100,7 +100,7 @@ def attain_goals(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
+    """Input of the work on a scenario; is handed to worker processes."""
 
     policy: Policy
     dataset: ScenarioDataset

@@ -82,9 +82,9 @@ def score_rollouts(
 ) -> Evaluation:
     """Score rollouts from files; every scenario's numbers are also written to `out/<name>.parquet`.
 
-    Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
+    Impossible rollouts, such as in a wrong frame, are scored with a warning that names scenario and agent.
 
-    Interrupted in any way, the same call goes on; once finished, it reads the result. Scenarios come in the order of
+    Interrupted in any way, the same call goes on; a finished result is read. Scenarios come in the order of
     the files, and in the order inside each file.
 
     Args:
@@ -97,7 +97,7 @@ def score_rollouts(
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: Files that cannot be read, agents that are not the scenario's, values that are no numbers or more
+        DataError: Files that cannot be read, agents of a different scenario, values that are no numbers or more
             than 1000 km from the origin, sets of different numbers of rollouts; under "error" also scenarios without
             road edges or unknown ones.
         ConfigError: A limit that would replace a stored result of more scenarios.
@@ -138,11 +138,11 @@ def score_rollouts(
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values under the names of the official messages; None where there is no number.
+    """Plain values under the names of the official messages; None = no number.
 
     `{"metric", "sources", "guessed", "scenarios": [{"scenario_id", fields, "buckets"}], "mean": {fields, "buckets"},
     "standard_error": ...}`.
-    Means are over the scenarios that have a number; the standard error needs two of them.
+    Means are over the scenarios that have a number; the standard error needs two numbers.
     """
     metric = metric_by_name(evaluation.config.metric)
     rows = evaluation.table.to_pylist()
@@ -158,7 +158,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def format_scores(evaluation: Evaluation) -> Table:
-    """Every mean ± standard error with the metric's version beside it; arrows say which way is better."""
+    """Every mean ± standard error with the metric's version; arrows show the better direction."""
     metric = metric_by_name(evaluation.config.metric)
     title = f"{evaluation.name}: {len(evaluation)} scenarios, {evaluation.config.num_rollouts} rollouts each"
     table = Table(title=title, title_justify="left", caption=evaluation.data_note or None, caption_justify="left")
@@ -179,7 +179,7 @@ def format_scores(evaluation: Evaluation) -> Table:
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
+    """Input of the work on a scenario; is handed to worker processes."""
 
     entries: tuple[RolloutEntry, ...]
     source: ScenarioSource
@@ -229,7 +229,7 @@ def hash_entries(entries: Sequence[RolloutEntry]) -> str:
 
 
 def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
-    """Row of one scenario, or why there is none."""
+    """Row of a scenario, or the reason for a missing row."""
     entry = job.entries[position]
     if entry.scenario_id not in job.source:
         return Skipped(entry.scenario_id, "not among the given scenarios")
@@ -253,12 +253,12 @@ def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
 
 
 def has_road_edge(scenario: Scenario) -> bool:
-    """True if the map has a road edge of two points or more; without one the official metric is undefined."""
+    """True if the map has a road edge of two points or more; else the official metric is undefined."""
     return len(select_polylines(scenario.map_features, ROAD_EDGE_TYPES).count) > 0
 
 
 def _check_maps(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
-    """Under "error" nothing may be missing from the means, also where an earlier run left it out."""
+    """Check, under "error", that no scenario is missing from the means, also by the choice of an earlier run."""
     mapless = [scenario for scenario in skipped if scenario.reason == _NO_ROAD_EDGE]
     if mapless and config.missing_map == "error":
         raise DataError(
