@@ -1,7 +1,7 @@
 """Rollouts in files, from any simulator: npz of a scenario, or submission files of the Sim Agents challenge.
 
-`find_rollouts` lists the scenarios without reading trajectories; `read_states` reads the rollouts of a scenario. No pickle is
-ever loaded, because loading runs any code in the file: docs/rollout_formats.md explains the conversion.
+`find_rollouts` lists the scenarios without reading trajectories; `read_states` reads the rollouts of a scenario. No
+pickle is ever loaded, because loading runs any code in the file: docs/rollout_formats.md explains the conversion.
 """
 
 import re
