@@ -73,7 +73,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class _GoalFiles(GroupFormat[Path, tuple[str, Any]]):
-    """Ids and `Points` of some scenarios, see `goals.stored`. A file that exists is finished: it is written whole."""
+    """Ids and `Points` of some scenarios, see `goals.stored`. A file that exists is finished."""
 
     folder: Path
     size: int
@@ -113,8 +113,8 @@ def augment_goals(
         Number of scenarios that have goals now.
 
     Raises:
-        DataError: A scenario withholds the future, or another driver is at work in the folder.
-        CheckpointError: The folder holds goals of another policy, other scenarios or other settings.
+        DataError: A scenario without a future, or a second driver at work in the folder.
+        CheckpointError: A folder with goals of a different policy, other scenarios or other settings.
         ConfigError: `top_k` is set and the policy's decisions are not categories.
         SetAside, Unfinished: See `run_items`.
     """

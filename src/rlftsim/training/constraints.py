@@ -1,4 +1,4 @@
-"""Means that calibration keeps as they are, by name: the value in a scenario, and the credit of each agent for it.
+"""Means that calibration does not change, by name: the value in a scenario, and the credit of each agent.
 
 B scenarios, N rollouts, A agents.
 """
@@ -31,9 +31,9 @@ class Constraint:
         return total.amin(1) if self.is_minimum else total.mean(1)
 
     def credit(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-        """What an agent's decisions in a rollout add to the value.
+        """The contribution of an agent's decisions in a rollout to the value.
 
-        Summed with their score functions over rollouts and agents it is an estimate of the value's gradient, without
+        The sum over rollouts and agents, times the score functions, is an estimate of the value's gradient, without
         bias where no agent's part depends on other agents.
         """
         if not self.is_minimum:
@@ -48,7 +48,7 @@ class Constraint:
 def subtract_baseline(added: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
     """Contributions of rollouts minus the mean of the other rollouts' contributions.
 
-    Where these depend on the rollout itself, as in `mloo`, its score function times the result is the gradient to first
+    Where these depend on the rollout, as in `mloo`, the score function times the result is the gradient to first
     order.
     """
     num_rollouts = added.shape[1]
@@ -56,7 +56,7 @@ def subtract_baseline(added: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
 
 
 def mean_speed(batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores) -> Float[Tensor, "B N A"]:
-    """Parts of the agents in their mean speed, m/s, over the steps that the log has."""
+    """Shares of the agents in the mean speed, m/s, over the steps that the log has."""
     speed, logged_valid = simulated_speeds(batch, rollouts)
     by_agent = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
     return _share(by_agent, logged_valid.any(-1))
@@ -70,12 +70,12 @@ def mean_evaluated_speed(batch: ScenarioBatch, rollouts: Rollouts, agents: Agent
 
 
 def displacement(batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores) -> Float[Tensor, "B N A"]:
-    """Parts of the evaluated agents in their displacement error, m."""
+    """Shares of the evaluated agents in the displacement error, m."""
     return agents.displacement_error.double()
 
 
 def _share(values: Float[Tensor, "B N A"], counts: Tensor) -> Float[Tensor, "B N A"]:
-    """Values of the agents that count over their number, 0 for others."""
+    """Values of the agents that count over the number of such agents, else 0."""
     number = counts.sum(-1).clamp(min=1)[:, None, None]
     return torch.where(counts[:, None], values, 0.0) / number
 

@@ -5,7 +5,7 @@ Methods are registered by name, also by other packages. In the pyproject.toml of
     [project.entry-points."rlftsim.methods"]
     nudge = "my_package:Nudge"
 
-The method's section in a recipe and its flags bear this name: `rlftsim finetune --method nudge --nudge.step 1`.
+Section and flags of the method bear this name: `rlftsim finetune --method nudge --nudge.step 1`.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -76,7 +76,7 @@ Settings = TypeVar("Settings", bound=TrainingSettings)
 
 @dataclass(eq=False, kw_only=True)
 class Learner:
-    """The state of a run that changes from update to update, which its checkpoints hold."""
+    """The state of a run that changes from update to update, stored in checkpoints."""
 
     policy: Any
     optimizer: Optimizer
@@ -101,7 +101,7 @@ class Learner:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Modules that a checkpoint holds, by their file name."""
+        """Modules that a checkpoint holds, by file name."""
         return {"policy": self.policy}
 
     @property
@@ -117,7 +117,7 @@ class Learner:
         """Take back the numbers of a checkpoint."""
 
     def finish(self) -> None:
-        """Make the result of what was learned, where the updates alone do not."""
+        """Make the result of the training, if the updates alone do not."""
 
     def finish_update(self, *, is_good: bool) -> None:
         """Take the optimizer's step, or skip it, and count the update either way.
@@ -135,7 +135,7 @@ class Learner:
 
 @dataclass(frozen=True, eq=False)
 class UpdateReport:
-    """The outcome of one update."""
+    """The outcome of an update."""
 
     values: dict[str, float]
     """Metrics by the names of metrics.jsonl."""
@@ -149,7 +149,7 @@ class UpdateReport:
 
 @dataclass(frozen=True, eq=False)
 class UpdateScenarios:
-    """Scenarios of a learner's next update that this process works on; read when a batch of them is requested."""
+    """Scenarios of a learner's next update that this process works on; read when a batch is requested."""
 
     scenarios: Scenarios
     """All training scenarios."""
@@ -166,7 +166,7 @@ class UpdateScenarios:
         """Indices of the scenarios of this process: a share of about equal cost.
 
         Args:
-            num_rollouts: Rollouts of each scenario, which processes that outnumber the scenarios divide among them.
+            num_rollouts: Rollouts of each scenario, divided among processes that outnumber the scenarios.
         """
         selected = scenarios_of_update(
             self.learner.update, self.settings.batch_size, len(self.scenarios), self.settings.seed
@@ -176,7 +176,7 @@ class UpdateScenarios:
         return local_indices(selected, self.fabric, costs, num_rollouts=num_rollouts)
 
     def batch(self, num_rollouts: int = 1) -> ScenarioBatch:
-        """All scenarios of this process as one batch on its device, with their futures.
+        """All scenarios of this process as a single batch on the process's device, with logged futures.
 
         Args:
             num_rollouts: Rollouts of each scenario, as in `indices`.
@@ -191,7 +191,7 @@ class UpdateScenarios:
         context_radius_m: float | None = None,
         mirror_probability: float = 0.0,
     ) -> Iterator[ScenarioBatch]:
-        """Yield the scenarios of this process in batches that fit into memory, each read when its turn comes.
+        """Yield the scenarios of this process in batches that fit into memory, each read when needed.
 
         Args:
             max_count: Scenarios of a batch at most, divided among processes that share a memory.
@@ -210,7 +210,7 @@ class UpdateScenarios:
 
 @runtime_checkable
 class Method(Protocol[Settings]):
-    """A way to train a policy. A class that extends this one inherits `describe` and `validates`."""
+    """A way to train a policy. A subclass inherits `describe` and `validates`."""
 
     settings: type[Settings]
     """Dataclass of the method's settings, all with defaults. The type of the settings says which method trains."""
@@ -220,7 +220,7 @@ class Method(Protocol[Settings]):
     """True = the settings have a section `validation`, and held-out scenarios may be validated on."""
 
     def describe(self, settings: Settings) -> str:
-        """The method in a few words, for the README of its models."""
+        """The method in a few words, for the README of the models."""
         return self.title
 
     def start(self, policy: Any, scenarios: Scenarios, settings: Settings, fabric: Fabric) -> Learner:
@@ -229,19 +229,19 @@ class Method(Protocol[Settings]):
         Called in each process, before the folder of the run is touched; `check_trainable` has the usual checks.
 
         Args:
-            policy: Policy to train in place; its weights may be on another device than that of `fabric`.
-            scenarios: All training scenarios, at least their index; reading each of them would take minutes.
+            policy: Policy to train in place; the weights may be on a different device than `fabric`.
+            scenarios: All training scenarios, at least the index; reading each scenario would take minutes.
             settings: Settings of the run.
             fabric: Device, precision and processes.
 
         Raises:
             ConfigError: The method cannot train this policy.
-            DataError: A scenario lacks what the method needs.
+            DataError: A scenario that lacks data for the method.
         """
         ...
 
     def update(self, learner: Learner, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
-        """Make one update, which ends with `learner.finish_update`.
+        """Make an update, which ends with `learner.finish_update`.
 
         Args:
             learner: Result of `start`, changed in place; `learner.update` counts from 0.
@@ -282,7 +282,7 @@ def method_by_name(name: str) -> Method[Any]:
 
 
 def find_method(settings: object) -> Method[Any] | None:
-    """The training method of settings, by their type; None where they are settings of no method."""
+    """The training method of settings, by type; None for settings of no method."""
     # Methods of other packages come last: a look at them imports all these packages.
     for list_names in (lambda: list(SHIPPED), METHODS.names):
         for name in list_names():
@@ -307,7 +307,7 @@ def check_trainable(
         scenarios: Training scenarios, at least one.
         method: Name of the training method in messages, such as "CAT-K".
         needs: Further attributes that the method uses, such as "vocabulary".
-        is_imitated: True = the method uses the pre-training loss; one of the two ways to define it is enough.
+        is_imitated: True = the method uses the pre-training loss; either way to define the loss is enough.
         is_rewarded: True = the method scores rollouts of every scenario.
 
     Raises:
