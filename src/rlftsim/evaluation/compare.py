@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -154,23 +155,11 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     rows_a, rows_b = pair_rows(a, b)
     clusters = a.clusters[rows_a]
     num_clusters = len(set(clusters)) if len(set(clusters)) < len(rows_a) else 0
+    compare_values = partial(compare_paired, alpha=alpha, clusters=clusters if num_clusters else None)
+    differences = tuple(compare_values(c, a.values(c)[rows_a], b.values(c)[rows_b]) for c in SCORE_COLUMNS)
+    num_paired = len(rows_a)
     return Comparison(
-        name_a=a.name,
-        name_b=b.name,
-        num_paired=len(rows_a),
-        num_only_a=len(a) - len(rows_a),
-        num_only_b=len(b) - len(rows_b),
-        differences=tuple(
-            compare_paired(
-                column,
-                a.values(column)[rows_a],
-                b.values(column)[rows_b],
-                alpha=alpha,
-                clusters=clusters if num_clusters else None,
-            )
-            for column in SCORE_COLUMNS
-        ),
-        num_clusters=num_clusters,
+        a.name, b.name, num_paired, len(a) - num_paired, len(b) - num_paired, differences, num_clusters=num_clusters
     )
 
 

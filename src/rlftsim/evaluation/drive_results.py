@@ -214,11 +214,8 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
     if not rows_a:
         raise DataError(f"{a.name} and {b.name} have no scenario in common.")
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
-    return DriveComparison(
-        a,
-        b,
-        tuple(compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns),
-    )
+    rows = (compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
+    return DriveComparison(a, b, tuple(rows))
 
 
 def format_drives(*results: DriveResult) -> Table:

@@ -6,7 +6,7 @@ An interrupted evaluation is resumed by the same call, see `evaluation.resumable
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -16,15 +16,7 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError, DataError, whole_number
-from rlftsim.evaluation.results import (
-    NUMBERS_VERSION,
-    EvaluateConfig,
-    Evaluation,
-    GoalChoice,
-    Provenance,
-    Skipped,
-    row_of_result,
-)
+from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
@@ -39,17 +31,6 @@ from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-
-__all__ = [
-    "EvaluateConfig",
-    "Evaluation",
-    "GoalChoice",
-    "Provenance",
-    "Skipped",
-    "evaluate",
-    "evaluation_name",
-    "simulate_states",
-]
 
 Oracle = Literal["oracle"]
 AnyPolicy = TypeVar("AnyPolicy")
@@ -110,7 +91,7 @@ def evaluate(
     return resume_evaluation(
         f"evaluate {name}",
         dataset.scenario_ids[: len(positions)],
-        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
+        partial(_evaluate_scenario, frozen, dataset, config),
         name=name,
         provenance=provenance,
         out=None if out is None else validate_folder(out),
@@ -235,25 +216,18 @@ def simulate_encoded(
     return joined if is_random else replace(joined, repeat=config.num_rollouts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to worker processes."""
-
-    policy: Policy | Oracle
-    dataset: ScenarioDataset
-    config: EvaluateConfig
-
-
-def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
+def _evaluate_scenario(
+    policy: Policy | Oracle, dataset: ScenarioDataset, config: EvaluateConfig, position: int
+) -> dict[str, object] | Skipped:
     """Row of a scenario, or the reason for a missing row."""
-    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
+    scenario, device = dataset[position], get_device(policy)
     try:
         scenario.check_consistency()
         scenario.check_finite_arrays()
     except DataError as error:
         # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
         raise DataError(
-            f"{job.dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
+            f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
             "such scenarios out."
         ) from None
     # Without a road edge, for instance, the official metric is undefined.
@@ -261,10 +235,10 @@ def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
         log = scenario_log(scenario, device)
     except DataError as error:
         return Skipped(scenario.scenario_id, str(error))
-    if isinstance(job.policy, str):
+    if isinstance(policy, str):
         states = logged_states(scenario, num_rollouts=config.num_rollouts, device=device)
     else:
         goals_of = evaluated_ends if config.goals == "logged" else None
-        states = simulate_states(job.policy, scenario, config, device, goals_of=goals_of)
+        states = simulate_states(policy, scenario, config, device, goals_of=goals_of)
     result = score(log, states, metric_by_name(config.metric))
-    return row_of_result(result, scenario, states, job.dataset.find_cluster(scenario.scenario_id))
+    return row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id))

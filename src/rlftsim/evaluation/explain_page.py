@@ -32,14 +32,9 @@ MAX_STRIPS = 10
 """Rows of (feature, agent) drawn over time."""
 MAX_SHOWN_ROLLOUTS = 8
 _UNITS = {
-    "linear_speed": "m/s",
-    "linear_acceleration": "m/s²",
-    "angular_speed": "rad/s",
-    "angular_acceleration": "rad/s²",
-    "distance_to_nearest_object": "m",
-    "time_to_collision": "s",
-    "distance_to_road_edge": "m",
-}
+    "linear_speed": "m/s", "linear_acceleration": "m/s²", "angular_speed": "rad/s", "angular_acceleration": "rad/s²",
+    "distance_to_nearest_object": "m", "time_to_collision": "s", "distance_to_road_edge": "m",
+}  # fmt: skip
 _BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
 _CSS = """
 .results thead th.narrow { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }

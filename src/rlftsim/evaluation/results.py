@@ -36,23 +36,11 @@ NUMBERS_VERSION = "0.1.0"
 no number keeps it, so that results outlive releases."""
 LIKELIHOOD_COLUMNS = tuple(f"{feature}_likelihood" for feature in FEATURE_NAMES)
 SCORE_COLUMNS = (
-    "meta_metric",
-    "meta_metric_light_one",
-    "kinematic",
-    "interactive",
-    "map_based",
-    *LIKELIHOOD_COLUMNS,
-    "min_average_displacement_error",
-    "average_displacement_error",
-    "collision_rate",
-    "offroad_rate",
-    "unlogged_offroad_rate",
-    "traffic_light_violation_rate",
-    "miss_rate",
-    "passing_miss_rate",
-    "min_passing_miss_rate",
+    "meta_metric", "meta_metric_light_one", "kinematic", "interactive", "map_based", *LIKELIHOOD_COLUMNS,
+    "min_average_displacement_error", "average_displacement_error", "collision_rate", "offroad_rate",
+    "unlogged_offroad_rate", "traffic_light_violation_rate", "miss_rate", "passing_miss_rate", "min_passing_miss_rate",
     *Drift._fields,
-)
+)  # fmt: skip
 """`meta_metric_light_one` is the meta-metric with the traffic light likelihood set to 1, as published tables of models
 without a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`; drift:
 `evaluation.drift`."""
@@ -61,13 +49,8 @@ LABELS = {"RMM": "meta_metric"}
 CLUSTER = "cluster"
 """Column with the street network or recording of a scenario; empty where the data set does not know it."""
 SCHEMA = pa.schema(
-    [
-        pa.field("scenario_id", pa.string()),
-        pa.field("num_agents", pa.int32()),
-        pa.field("num_evaluated", pa.int32()),
-        pa.field(CLUSTER, pa.string()),
-        *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
-    ]
+    {"scenario_id": pa.string(), "num_agents": pa.int32(), "num_evaluated": pa.int32(), CLUSTER: pa.string()}
+    | dict.fromkeys(SCORE_COLUMNS, pa.float64())
 )
 
 LARGEST = 1e7

@@ -80,7 +80,7 @@ def measure_variances(
     identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
     stored = measure_scenarios(
         "variances",
-        partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes)),
+        partial(_measure_scenario, frozen_copy(policy), dataset, config, sizes),
         ScenarioValues(Path(out), ids, dict.fromkeys(ids, identity), _parse_variances),
         jobs=config.jobs,
         show_progress=show_progress,
@@ -114,16 +114,6 @@ def variance_by_size(
     return variances
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to worker processes."""
-
-    policy: Policy
-    dataset: ScenarioDataset
-    config: EvaluateConfig
-    sizes: tuple[int, ...]
-
-
 def _parse_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
     """Stored variances of a scenario [rewards, sizes]; empty for a scenario that cannot be scored.
 
@@ -136,19 +126,21 @@ def _parse_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.nd
     return variances
 
 
-def _measure_scenario(job: _Job, position: int) -> dict[str, object]:
+def _measure_scenario(
+    policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig, sizes: tuple[int, ...], position: int
+) -> dict[str, object]:
     """Simulate once and score subsets of the rollouts."""
-    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
+    scenario, device = dataset[position], get_device(policy)
     try:
         log = scenario_log(scenario, device)
     except DataError as error:
         return {"variances": [], "skipped": str(error)}
     # features once for all rollouts: subsets pick rows of them, which is what training would compute
-    features = compute_features(log, simulate_states(job.policy, scenario, config, device))
+    features = compute_features(log, simulate_states(policy, scenario, config, device))
     score_subset = partial(_score_subset, log, features, config.metric)
     # by scenario: neither the order of the scenarios nor the number of processes changes the subsets
     rng = np.random.default_rng([config.seed, *scenario.scenario_id.encode()])
-    return {"variances": variance_by_size(score_subset, config.num_rollouts, job.sizes, rng).tolist()}
+    return {"variances": variance_by_size(score_subset, config.num_rollouts, sizes, rng).tolist()}
 
 
 def _score_subset(

@@ -18,14 +18,7 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction
-from rlftsim.evaluation.results import (
-    SCORE_COLUMNS,
-    EvaluateConfig,
-    Evaluation,
-    Provenance,
-    Skipped,
-    row_of_result,
-)
+from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
@@ -125,7 +118,7 @@ def score_rollouts(
     result = resume_evaluation(
         f"score {name}",
         [entry.scenario_id for entry in entries],
-        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        partial(_score_entry, tuple(entries), source, config, num_rollouts),
         name=name,
         provenance=provenance,
         out=None if out is None else Path(out),
@@ -177,17 +170,6 @@ def format_scores(evaluation: Evaluation) -> Table:
     return table
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to worker processes."""
-
-    entries: tuple[RolloutEntry, ...]
-    source: ScenarioSource
-    config: ScoreConfig
-    num_rollouts: int
-    """Of the first scenario; all others must have as many."""
-
-
 def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, path: Path) -> None:
     """Check that rollouts have scenarios, and mention scenarios with several sets of rollouts.
 
@@ -228,28 +210,30 @@ def hash_entries(entries: Sequence[RolloutEntry]) -> str:
     return digest.hexdigest()
 
 
-def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
-    """Row of a scenario, or the reason for a missing row."""
-    entry = job.entries[position]
-    if entry.scenario_id not in job.source:
+def _score_entry(
+    entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, num_rollouts: int, position: int
+) -> dict[str, object] | Skipped:
+    """Row of a scenario, or the reason for a missing row; all scenarios must have the same number of rollouts."""
+    entry = entries[position]
+    if entry.scenario_id not in source:
         return Skipped(entry.scenario_id, "not among the given scenarios")
-    scenario = job.source.by_id(entry.scenario_id)
+    scenario = source.by_id(entry.scenario_id)
     if not has_road_edge(scenario):
         skipped = Skipped(scenario.scenario_id, _NO_ROAD_EDGE)
-        _check_maps([skipped], job.config)
+        _check_maps([skipped], config)
         return skipped
     states = read_states(entry)
-    if states.num_rollouts != job.num_rollouts:
+    if states.num_rollouts != num_rollouts:
         raise DataError(
-            f"{entry}: {states.num_rollouts} rollouts, others have {job.num_rollouts}: the meta-metric depends on the "
+            f"{entry}: {states.num_rollouts} rollouts, others have {num_rollouts}: the meta-metric depends on the "
             "number, so a mean over both means nothing. Score them apart."
         )
     try:
-        result = score(scenario_log(scenario), states, metric_by_name(job.config.metric))
+        result = score(scenario_log(scenario), states, metric_by_name(config.metric))
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
     warn_of_doubts(scenario, states, entry.file)
-    return row_of_result(result, scenario, states, job.source.find_cluster(entry.scenario_id))
+    return row_of_result(result, scenario, states, source.find_cluster(entry.scenario_id))
 
 
 def has_road_edge(scenario: Scenario) -> bool:

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError
-from rlftsim.evaluation.evaluate import EvaluateConfig, GoalChoice, evaluate
-from rlftsim.evaluation.results import Evaluation
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.evaluation.results import Evaluation, GoalChoice
 from rlftsim.experiments.model_specs import BASE, CATK, GCSL, ROAD, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
 from rlftsim.experiments.rows import Row
 from rlftsim.experiments.stage_progress import Stage, run_stages

@@ -34,7 +34,7 @@ LARGEST_RATIO = 10.0
 
 
 def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Experience]:
-    """The rollouts as if sampled under goals that the most realistic rollout has met, with the rewards under these goals.
+    """The rollouts as if sampled under goals that the most realistic rollout has met, with new rewards.
 
     Only the reward's goal terms count: realism does not depend on goals and was rewarded before. Each agent earns
     its own part, because each agent's decisions have a separate importance ratio.
