@@ -245,14 +245,13 @@ def _with_rmm(count: int, num_scenarios: int) -> str:
     return f" ({count} with RMM)" if count < num_scenarios else ""
 
 
-def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = None) -> Table:
+def format_table(*evaluations: Evaluation) -> Table:
     """A row per evaluation: mean ± standard error over the scenarios. Arrows point in the better direction.
 
     Args:
-        evaluations: Evaluations in the order of the rows.
-        columns: Columns of the table; None = `select_columns` of the evaluations.
+        evaluations: Evaluations in the order of the rows; `select_columns` chooses the columns.
     """
-    columns = columns or select_columns(*evaluations)
+    columns = select_columns(*evaluations)
     with_goals = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
     notes = list(dict.fromkeys(evaluation.data_note for evaluation in evaluations))
     if with_goals:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from rlftsim import __version__
 from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
-from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
 from rlftsim.jobs.files import remove_folder, write_text
 from rlftsim.jobs.folder import Lease, check_folder
@@ -91,7 +91,7 @@ def explain_rollouts(
         name = entry.scenario_id.replace("/", "_") or "scenario"
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
         items[next(page for page in (f"{n}.html" for n in numbered) if page not in items)] = entry
-    identity = repr((hash_entries(entries), source.fingerprint, config.metric, config.missing_map, __version__))
+    identity = repr((hash_entries(entries), hash_source(source), config.metric, config.missing_map, __version__))
     pages = Path(out) / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
     runner = runner or choose_runner(config.num_jobs, len(items))
     with Lease(pages / ".lock", runner, "works in") as lease:

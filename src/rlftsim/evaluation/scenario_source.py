@@ -5,7 +5,6 @@ import io
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig
@@ -20,42 +19,6 @@ from rlftsim.scenario.womd import find_tfrecords, scenario_from_bytes
 _SCENARIO_ID_FIELD = 5
 _HEADER_BYTES = 12
 _CACHED_SCENARIOS = 2  # each is read once
-
-
-@runtime_checkable
-class ScenarioSource(Protocol):
-    """Scenarios by id; can be handed to worker processes."""
-
-    @property
-    def fingerprint(self) -> str:
-        """Hash of the contents."""
-        ...
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the data sources."""
-        ...
-
-    @property
-    def guessed(self) -> tuple[str, ...]:
-        """Values that are guessed in some scenarios, see `Scenario.guessed`."""
-        ...
-
-    def __contains__(self, scenario_id: object) -> bool: ...
-
-    def __len__(self) -> int: ...
-
-    def by_id(self, scenario_id: str) -> Scenario:
-        """The scenario of an id.
-
-        Raises:
-            DataError: An unknown id, or damaged bytes.
-        """
-        ...
-
-    def find_cluster(self, scenario_id: str) -> str | None:
-        """Label of a scenario's street network or recording; None = unknown."""
-        ...
 
 
 def open_held_out(
@@ -106,40 +69,6 @@ def hash_manifest(folder: Path) -> str:
     return hash_file(folder / MANIFEST)
 
 
-def open_scenarios(source: str | PathLike[str]) -> ScenarioSource:
-    """The scenarios of a converted data set's folder, or of tfrecords: a file, a folder or a glob.
-
-    Raises:
-        DataError: A missing source, or a damaged record.
-    """
-    if (Path(source) / MANIFEST).is_file():
-        return ConvertedScenarios(Path(source))
-    return index_tfrecords(Path(source))
-
-
-class ConvertedScenarios:
-    """The scenarios of a data set's folder, of all splits."""
-
-    def __init__(self, folder: Path) -> None:
-        self._dataset = ScenarioDataset(folder, cache_size=_CACHED_SCENARIOS)
-        self.fingerprint = hash_manifest(folder)
-        self.sources, self.guessed = self._dataset.sources, self._dataset.guessed
-
-    def __contains__(self, scenario_id: object) -> bool:
-        return scenario_id in self._dataset
-
-    def __len__(self) -> int:
-        return len(self._dataset)
-
-    def by_id(self, scenario_id: str) -> Scenario:
-        """The scenario of an id, see `ScenarioSource`."""
-        return self._dataset.by_id(scenario_id)
-
-    def find_cluster(self, scenario_id: str) -> str | None:
-        """Label of the street network or recording, see `ScenarioSource`."""
-        return self._dataset.find_cluster(scenario_id)
-
-
 @dataclass(frozen=True)
 class RecordSpan:
     """Location of a record's bytes."""
@@ -165,7 +94,11 @@ class LoggedScenarios:
         return len(self.spans)
 
     def by_id(self, scenario_id: str) -> Scenario:
-        """The scenario of an id, see `ScenarioSource`."""
+        """The scenario of an id.
+
+        Raises:
+            DataError: An unknown id, or damaged bytes.
+        """
         if scenario_id not in self.spans:
             raise DataError(f"no scenario {scenario_id!r} among {len(self)} logged ones")
         span = self.spans[scenario_id]
@@ -180,6 +113,26 @@ class LoggedScenarios:
     def find_cluster(self, scenario_id: str) -> str | None:
         """None: records do not name the recording."""
         return None
+
+
+ScenarioSource = ScenarioDataset | LoggedScenarios
+"""Scenarios by id; can be handed to worker processes."""
+
+
+def open_scenarios(source: str | PathLike[str]) -> ScenarioSource:
+    """The scenarios of a converted data set's folder, of all splits, or of tfrecords: a file, a folder or a glob.
+
+    Raises:
+        DataError: A missing source, or a damaged record.
+    """
+    if (Path(source) / MANIFEST).is_file():
+        return ScenarioDataset(source, cache_size=_CACHED_SCENARIOS)
+    return index_tfrecords(Path(source))
+
+
+def hash_source(source: ScenarioSource) -> str:
+    """SHA-256 of a data set's manifest, or of the records of tfrecord files."""
+    return hash_manifest(source.folder) if isinstance(source, ScenarioDataset) else source.fingerprint
 
 
 def index_tfrecords(source: Path) -> LoggedScenarios:

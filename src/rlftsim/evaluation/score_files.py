@@ -22,7 +22,7 @@ from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation
 from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
-from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
@@ -110,7 +110,7 @@ def score_rollouts(
         # of all, also under a limit: a quick look and the whole are of the same rollouts
         policy_fingerprint=hash_entries(all_entries),
         dataset=str(scenarios.absolute()),
-        manifest_sha256=source.fingerprint,
+        manifest_sha256=hash_source(source),
         sources=source.sources,
         guessed=source.guessed,
     )
