@@ -92,6 +92,7 @@ def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, mo
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
+        ({"timestamps_s": None}, "timestamps are None, not one number for each step"),
         ({"timestamps_s": np.arange(91.0)}, "step 1 is 1.000 s after step 0 instead of 0.1 s: steps must be"),
         (
             {"tracks_to_predict": np.array([1, 1], np.int32), "difficulty": np.zeros(2, np.int8)},

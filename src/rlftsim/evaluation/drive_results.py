@@ -15,6 +15,7 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
+from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import read_parquet, read_parquet_metadata
@@ -140,7 +141,7 @@ def _check_columns(table: pa.Table) -> None:
     Raises:
         KeyError: A missing column.
         TypeError: A column of values of a wrong type.
-        ValueError: A scenario that is there twice, or an infinite number.
+        ValueError: A scenario that is listed twice, or an impossible number.
     """
     for name in (*TEXTS, *MAIN_SCORES):
         if name not in table.schema.names:
@@ -148,8 +149,8 @@ def _check_columns(table: pa.Table) -> None:
     for name, column in zip(table.schema.names, table.columns):
         if column.type != (pa.string() if name in TEXTS else pa.float64()) or column.null_count:
             raise TypeError(f"column {name} has empty cells or those of another type")
-        if name not in TEXTS and np.isinf(column.to_numpy()).any():
-            raise ValueError(f"column {name} has an infinite number")
+        if name not in TEXTS and (np.abs(column.to_numpy()) > LARGEST).any():
+            raise ValueError(f"column {name} has a number beyond {LARGEST:g}")
     ids = table["scenario_id"].to_pylist()
     if len({*ids}) < len(ids):
         raise ValueError("a scenario is there twice")

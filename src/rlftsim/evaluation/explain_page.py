@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim import __version__
+from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
@@ -96,13 +97,25 @@ def explain_rollouts(
     runner = runner or choose_runner(config.num_jobs, len(items))
     with Lease(pages / ".lock", runner, "works in") as lease:
         finished = run_items(
-            "explain", list(items.items()), partial(_write_page, pages, source, config),
-            format=WholeFiles(pages, itemgetter(0)), lease=lease, runner=runner, show_progress=show_progress,
+            "explain", list(items.items()), partial(_write_page, pages, source, config), lease=lease, runner=runner,
+            format=WholeFiles(pages, itemgetter(0), _read_page), show_progress=show_progress,
         )  # fmt: skip
         written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
         lease.remove()
         remove_folder(pages, items)
     return written
+
+
+def _read_page(path: Path) -> str:
+    """Text of a page, empty where there is nothing to explain.
+
+    Raises:
+        DataError: The page is cut off.
+    """
+    html = path.read_text(encoding="utf-8", errors="replace")
+    if html and not html.endswith("</html>\n"):
+        raise DataError(f"{path}: its end is missing.")
+    return html
 
 
 def _write_page(

@@ -23,7 +23,7 @@ from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, 
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_folder, remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
-from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, run_items
+from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Inline, Joining, Runner, Share, choose_runner
 
@@ -147,8 +147,9 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
 
         Raises:
             ConfigError: A result of other work, or with scenarios that a limit would leave out.
+            DataError: Another file of this name.
         """
-        stored = read_stored(self.result_path, Evaluation.read)
+        stored = read_finished(self.result_path, Evaluation.read)
         if stored is None:
             return None
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
@@ -378,17 +379,18 @@ def check_scenarios_stay(path: Path, num_stored: int, num_left_out: int, choice:
         )
 
 
-def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
-    """A stored result; None for a missing file, or a damaged file, which a message names.
+def read_finished(path: Path, read: Callable[[Path], FinishedResult]) -> FinishedResult | None:
+    """The result in a file; None for a missing file.
 
     Args:
-        path: File of the result.
-        read: Reader of the file; raises a DataError with the way out, which is to do the work again.
+        path: File that a new result would replace.
+        read: Reader of the file; raises a DataError that ends in a way out.
+
+    Raises:
+        DataError: A file that is no such result, or damaged, and that may be a user's, so it stays.
     """
-    if not path.exists():
-        return None
     try:
-        return read(path)
+        return read(path) if path.exists() else None
     except DataError as error:
-        log.info(f"{error} Doing so.")
-        return None
+        cause = str(error).removeprefix(f"{path}: ").rpartition(": ")[0]
+        raise DataError(f"{path} is in the way ({cause}): choose another --out, or remove the file.") from None

@@ -18,8 +18,8 @@ from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
-from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner
+from rlftsim.realism import SimulatedStates
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, get_device
@@ -75,7 +75,7 @@ def simulate_folder(
         SetAside, Unfinished: See `run_items`.
     """
     identity = simulation.describe(model)
-    rollouts = _RolloutFiles(out, "{}.npz".format, num_rollouts=simulation.num_rollouts)
+    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_read_rollouts, simulation.num_rollouts))
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
@@ -89,42 +89,33 @@ def simulate_folder(
     return paths
 
 
-@dataclass(frozen=True, eq=False)
-class _RolloutFiles(WholeFiles[str]):
-    """Rollouts by scenario id, see `rollout.files`."""
+def _read_rollouts(num_rollouts: int, path: Path) -> SimulatedStates:
+    """Rollouts of the scenario that the file is named after; checksums, types and shapes of the arrays are right.
 
-    num_rollouts: int = 1
-
-    def is_finished(self, item: str) -> bool:
-        """True for a file whose arrays have the right checksums, types and shapes; a warning names any other file."""
-        path = self.read(item)
-        if path is None:
-            return False
-        cause = f"it holds other rollouts than {self.num_rollouts} of its scenario"
-        try:
-            states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == item]
-            if [len(rollouts.x) for rollouts in states] == [self.num_rollouts]:
-                return True
-        except DataError as error:
-            cause = str(error).removeprefix(f"{path} ").rstrip(".")
-        log.warning(f"{path} is simulated again: {cause}.")
-        return False
+    Raises:
+        DataError: Damaged file, or other rollouts.
+    """
+    states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == path.stem]
+    if [len(rollouts.x) for rollouts in states] != [num_rollouts]:
+        raise DataError(f"{path}: it holds other rollouts than {num_rollouts} of its scenario.")
+    return states[0]
 
 
 def _simulate_scenario(
     simulation: Simulation, out: Path, scenario_id: str, advance: Advance, is_stopped: Callable[[], bool]
-) -> None:
-    """Write the rollouts of a scenario, unless the work is being stopped."""
+) -> Path | None:
+    """File with the rollouts of a scenario, written now; None where the work is being stopped."""
     if is_stopped():
-        return
+        return None
     batch = collate([simulation.scenarios.by_id(scenario_id)]).to(get_device(simulation.policy))
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
         sampling=simulation.sampling, goals=goals_of_batch(entries, batch) if entries else None,
     )  # fmt: skip
-    write_rollouts(out, batch, rollouts)
+    [path] = write_rollouts(out, batch, rollouts)
     advance(1)
+    return path
 
 
 def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool = True) -> None:

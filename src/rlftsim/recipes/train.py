@@ -22,7 +22,8 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.goals import not_conditioned
 from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.method import TrainingSettings, find_method
+from rlftsim.training.method import TrainingSettings
+from rlftsim.training.registry import find_method
 from rlftsim.training.run import train_policy
 
 CACHED_SCENARIOS = 4096

@@ -1,4 +1,4 @@
-"""Positions, velocities and headings of logged tracks held against each other.
+"""Positions, heights, velocities and headings of logged tracks held against each other.
 
 They are redundant, so a log in another frame, unit or time base contradicts itself. A single track may, because its
 detections are noisy; a scenario does where more than half of its moving tracks do.
@@ -17,6 +17,7 @@ MOVING_MPS = 1.0
 SPEED_TOLERANCE_MPS, SPEED_TOLERANCE = 1.0, 0.3
 """Largest difference between a velocity and the change of position, or this fraction of the faster one. Beyond are 0 of
 187 moving tracks of WOMD, 0 of 2 657 synthetic ones and 7 of 32 of Argoverse 2, whose positions are noisy."""
+TYPES_WITH_FRONT = (ObjectType.VEHICLE, ObjectType.CYCLIST)
 DRIVING_MPS = 3.0
 """Vehicles and cyclists that are faster face the way they move; slower ones may back up, and pedestrians step aside."""
 LEAST_COSINE = math.cos(math.pi / 4)
@@ -39,11 +40,12 @@ def describe_contradictions(tracks: Tracks) -> str:
         is_off = off_mps > np.maximum(SPEED_TOLERANCE_MPS, SPEED_TOLERANCE * faster)
         heading = tracks.heading[:, 1:]
         is_askew = dx * np.cos(heading) + dy * np.sin(heading) < LEAST_COSINE * moved_mps
-    has_front = (tracks.object_type == ObjectType.VEHICLE) | (tracks.object_type == ObjectType.CYCLIST)
+        climb_mps = np.abs(np.diff(tracks.position[..., 2])) / np.float32(STEP_S)
+    has_front = np.isin(tracks.object_type, TYPES_WITH_FRONT)
     is_moving = seen & (2 * (seen & (faster > MOVING_MPS)).sum(1) > seen.sum(1))[:, None]
     is_driving = seen & (moved_mps > DRIVING_MPS) & has_front[:, None]
     texts = []
-    contrary, num_judged = _find_contrary(is_moving, is_off)
+    contrary, num_judged = find_contrary(is_moving, is_off)
     if 2 * len(contrary) > num_judged:
         track = contrary[0]
         steps = is_moving[track] & is_off[track]
@@ -53,19 +55,32 @@ def describe_contradictions(tracks: Tracks) -> str:
             f"{tracks.object_id[track]} moves at {by_position:.1f} m/s, its velocity is {by_velocity:.1f} m/s and "
             f"{apart:.1f} m/s off"
         )
-    contrary, num_judged = _find_contrary(is_driving, is_askew)
+    contrary, num_judged = find_contrary(is_driving, is_askew)
     if 2 * len(contrary) > num_judged:
         texts.append(
             f"headings contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
             f"{DRIVING_MPS:g} m/s: track {tracks.object_id[contrary[0]]} faces more than 45 degrees away from it"
         )
+    contrary, num_judged = find_contrary(is_driving, climb_mps > moved_mps)
+    if 2 * len(contrary) > num_judged:
+        track = contrary[0]
+        texts.append(
+            f"heights contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
+            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[track]} climbs or falls at "
+            f"{float(np.median(climb_mps[track, is_driving[track]])):.1f} m/s, more than 45 degrees"
+        )
     return "; ".join(texts)
 
 
-def _find_contrary(
+def find_contrary(
     is_judged: Bool[np.ndarray, "O s"], is_contrary: Bool[np.ndarray, "O s"]
 ) -> tuple[Int64[np.ndarray, "n"], int]:
-    """Tracks that contradict themselves in most of the steps in which they are judged, and how many are judged."""
+    """Tracks that contradict themselves in most of the steps in which they are judged, and how many are judged.
+
+    Args:
+        is_judged: True = the track is judged at the step; at fewer than `LEAST_STEPS` it is not judged at all.
+        is_contrary: True = the track contradicts itself there.
+    """
     num_steps = is_judged.sum(1)
     is_enough = num_steps >= LEAST_STEPS
     return np.flatnonzero(is_enough & (2 * (is_judged & is_contrary).sum(1) > num_steps)), int(is_enough.sum())

@@ -22,7 +22,7 @@ from rlftsim.jobs.documents import parse_json, read_json
 from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease, check_folder, check_name
 from rlftsim.jobs.items import ResultFormat, run_items
-from rlftsim.jobs.runner import Runner, check_finished, choose_runner, usable_cores
+from rlftsim.jobs.runner import Runner, check_finished, choose_runner, select_items, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -222,7 +222,7 @@ def convert(
 
     # 3. Make the shards that earlier runs have not finished, then index and manifest.
     runner = runner or choose_runner(jobs or usable_cores(), len(tasks), on_death=on_error)
-    selected = {task.shard for task in runner.select(tasks)}
+    selected = {task.shard for task in select_items(runner, tasks)}
     shards = _Shards(folder, data_source)
     for task in tasks:
         if task.shard not in selected:

@@ -20,9 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64
 
 from rlftsim.errors import DataError, in_short
+from rlftsim.jobs.documents import MAX_NAME_BYTES
 
-MAX_ID_BYTES = 200
-"""Of a scenario id; file systems take names of 255 bytes, and a suffix follows."""
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
@@ -233,11 +232,11 @@ class Scenario:
             DataError: it is no text or empty, too long, or has a slash or a control character.
         """
         name = self.scenario_id
-        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_ID_BYTES
+        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_NAME_BYTES
         if not is_text or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
             raise DataError(
                 f"scenario id {in_short(name)} is no file name, and files are named after it: write it as text of at "
-                f"most {MAX_ID_BYTES} bytes without slashes and control characters"
+                f"most {MAX_NAME_BYTES} bytes without slashes and control characters"
             )
 
     def check_array_shapes(self) -> None:
@@ -441,6 +440,8 @@ def _check_shapes(part: Any, place: str) -> None:
 
 def _check_time_base(timestamps_s: Float[np.ndarray, "t"], num_steps: int) -> None:
     """Refuse timestamps that are not 0.1 s apart: speeds, tokens and scores would be wrong by a factor."""
+    if np.ndim(timestamps_s) != 1:
+        raise DataError(f"timestamps are {in_short(timestamps_s)}, not one number for each step")
     if len(timestamps_s) != num_steps:
         raise DataError(f"{len(timestamps_s)} timestamps for {num_steps} steps")
     offset_s = timestamps_s - timestamps_s[0]

@@ -192,6 +192,7 @@ def scenario_from_bytes(record: bytes) -> Scenario:
     )
     scenario.check_consistency()
     scenario.check_finite_arrays()
+    scenario.check_precision()
     return scenario
 
 

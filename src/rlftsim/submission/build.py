@@ -32,7 +32,7 @@ from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.items import ResultFormat, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import Runner, choose_runner
+from rlftsim.jobs.runner import Runner, choose_runner, select_items
 from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -135,7 +135,7 @@ def build_archive(
         if lease.is_alone:
             remove_temporaries_below(shards)
         receipts = _Receipts(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
-        _forecast(job, sum(not receipts.is_finished(n) for n in runner.select(numbers)))
+        _forecast(job, sum(not receipts.is_finished(n) for n in select_items(runner, numbers)))
         packed_shards = run_items(
             "submit", numbers, partial(_build_shard, job),
             format=receipts, lease=lease, runner=runner, show_progress=show_progress,

@@ -1,7 +1,8 @@
-"""Alarms: a policy that exploits its reward drifts away from the log in ways that a few statistics show.
+"""Alarms: a policy that exploits the reward drifts away from the log in ways that a few statistics show.
 
 Running means of these statistics are compared with those of the run's first updates. The level of an alarm is the drift
-over its threshold, so alarms are raised from 1 on. A warning is logged once per alarm; the run goes on.
+over the threshold, so the alarm is raised from 1 on. A warning is logged once when the alarm is raised; the run goes
+on.
 """
 
 import math
@@ -109,7 +110,7 @@ class Running:
 
 @dataclass
 class Alarms:
-    """The watched means of a run, stored in checkpoints."""
+    """The watched means of a run, which checkpoints hold."""
 
     means: dict[str, Running] = field(default_factory=lambda: {m.alarm: Running() for m in DRIFT_MONITORS})
 

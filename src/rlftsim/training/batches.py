@@ -1,6 +1,6 @@
 """Scenarios of an update, spread over processes and cut into pieces that fit into memory.
 
-Losses are sums that are divided by global counts, so batches change no gradient, only time and memory.
+Losses are sums that are divided by global counts, so this module never changes a gradient, only time and memory.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def count_columns(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndar
     """Counts of each scenario by columns of the index, from the index of a data set without a scenario being read.
 
     Args:
-        scenarios: A data set with an index, or scenarios that are counted here.
+        scenarios: a data set, or scenarios of other types, which are counted here.
         columns: fields of `IndexRow` that are numbers.
     """
     if isinstance(scenarios, ScenarioDataset):

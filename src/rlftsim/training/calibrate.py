@@ -3,13 +3,13 @@
     eta = length * natural direction(gradient of the reward, Fisher matrix, gradients of constrained means)
 
 1. Rollouts of most of the training scenarios. The score function of the weights, summed over an agent's decisions,
-   times what the agent earned is an estimate of the reward's gradient, with the Fisher matrix as covariance. There is
-   no backward pass through the network, no optimizer and no learning rate.
-2. The direction of the largest predicted gain per KL, without a change of the constrained means.
+   times the agent's reward is an estimate of the reward's gradient; the covariance is the Fisher matrix. There is no
+   backward pass through the network, no optimizer and no learning rate.
+2. The direction of the largest predicted gain per KL among the directions that leave the constrained means unchanged.
 3. The length: rollouts of the scenarios that were held back, with the same noise for each length that is tried.
 
 A few weights need few rollouts: the signal of ten features is as large as the noise after some hundreds of rollouts,
-that of all weights of a network is not after tens of thousands. K features, C constraints, N rollouts, A agents.
+the signal of all weights of a network is not after tens of thousands. K features, C constraints, N rollouts, A agents.
 """
 
 import math
@@ -122,7 +122,7 @@ class CalibrateConfig:
             num_scenarios: Number of scenarios in the data set, at least 2.
 
         Raises:
-            ConfigError: Fewer than two.
+            ConfigError: Fewer than two scenarios.
         """
         if num_scenarios < 2:
             raise ConfigError("calibration needs at least 2 scenarios: one for the direction and one for its length.")
@@ -132,8 +132,9 @@ class CalibrateConfig:
         return selected[num_held_back:], selected[:num_held_back]
 
     def tasks(self, num_scenarios: int) -> list[tuple[int | None, list[int]]]:
-        """Batches of the run in order: the length that is tried (0 = no step; None = search of the direction),
-        and positions in the list of those scenarios.
+        """Batches of the run in order, each a stage and positions in the list of the stage's scenarios.
+
+        Stage None finds the direction, stage 0 measures without a step, stage i tries length i.
 
         Args:
             num_scenarios: Number of scenarios in the data set, at least 2.
@@ -211,7 +212,7 @@ class Statistics(nn.Module):
 
 @dataclass(eq=False, kw_only=True)
 class CalibrationLearner(Learner):
-    """A policy with features that get weights, and the statistics that these follow from."""
+    """A policy with weights for features, and the statistics that the weights follow from."""
 
     scenarios: Scenarios
 
@@ -229,14 +230,14 @@ class CalibrationLearner(Learner):
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """The statistics, which suffice for a checkpoint."""
+        """The statistics: a checkpoint needs no other modules."""
         return {"statistics": self.statistics}
 
     def measure(self, fabric: Fabric) -> UpdateReport:
         """Measure the next batch of scenarios.
 
         Args:
-            fabric: Processes that share the measurements.
+            fabric: Processes, each of which measures a part of the batch.
         """
         stage, positions = self.tasks[self.update]
         # Row by row and added to zeros, so that no number depends on the processes.
@@ -267,7 +268,7 @@ class CalibrationLearner(Learner):
         return natural_direction(mean[0], self.statistics.fisher.numpy() / max(decisions, 1.0), fixed, self.config.kl)
 
     def fit(self) -> tuple[Float64[np.ndarray, "K"], dict[str, Any]]:
-        """The weights and the measurements behind, in types of JSON."""
+        """The weights, and a record of the fit: values that JSON has."""
         scores = {name: self.statistics.scores[..., index].numpy() for index, name in enumerate(self.names)}
         kls = scores["kl"].sum(1) / scores["num_decisions"].sum(1).clip(1)  # [1 + X]
         gains = scores["rmm"][1:] - scores["rmm"][0]  # [X, S]

@@ -1,7 +1,7 @@
-"""Checkpoints: all that a run resumes from, in files that execute no code.
+"""Checkpoints: all that a run resumes from, in files without code.
 
 A checkpoint is a folder `update-00000120` with safetensors and a JSON file. The folder is written under a temporary
-name and renamed when complete, so a folder of that name is never half-written.
+name and renamed when whole, so a folder of that name is never half-written.
 """
 
 import json
@@ -41,11 +41,10 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
         folder: the run's folder of checkpoints.
         progress: position of the run.
         modules: weights by file name, such as policy and reference.
-        optimizer: Optimizer of the weights; the moments are stored, too.
+        optimizer: Optimizer with the moments to store, too.
 
     Raises:
-        DataError: A file that cannot be written, such as on a full disk; the message names the file. Older checkpoints
-            are untouched.
+        DataError: a file cannot be written, such as on a full disk; names it. Older checkpoints are untouched.
     """
     target = folder / f"{PREFIX}{progress.update:08d}"
     partial = folder / f".partial-{target.name}"
@@ -69,12 +68,12 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The latest complete checkpoint of a run; None without any."""
+    """The latest whole checkpoint of a run; None if there is none yet."""
     return max(_checkpoints(folder), default=None)
 
 
 def _checkpoints(folder: Path) -> list[Path]:
-    """Complete checkpoints of a run, the latest last; other files of a similar name are a user's."""
+    """Whole checkpoints of a run, the latest last; other files of a similar name belong to a user."""
     return sorted(path for path in folder.glob(f"{PREFIX}*") if path.name.removeprefix(PREFIX).isdecimal())
 
 
@@ -95,7 +94,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         The position of the run.
 
     Raises:
-        CheckpointError: Damaged, or of a different model.
+        CheckpointError: damaged, or of a different model.
     """
     way_out = "cannot go on from it, delete this folder to go on from an older one"
     try:
@@ -129,7 +128,7 @@ def _check_progress(values: Mapping[str, Any], update: int) -> None:
     """Check the position of a run against the name of the folder.
 
     Raises:
-        ValueError: The position of a different update, or a number that is missing or not finite.
+        ValueError: A position of a different update, or a number that is missing or not finite.
     """
     if type(values.get("update")) is not int or values["update"] != update:
         raise ValueError(f"its update is {str(values.get('update'))[:40]!r}, not {update}")

@@ -46,12 +46,12 @@ class ClosedLoopPrediction:
 def predict_targets(
     policy: TokenPolicy, context: Any, targeted: TargetedRollouts, trained: Bool[Tensor, "B A"]
 ) -> ClosedLoopPrediction:
-    """Predictions along rollouts: differentiable, a single parallel pass.
+    """Predictions along rollouts: differentiable, in a single parallel pass.
 
     Args:
         policy: the policy that rolled out.
-        context: The policy's encoding of the same scenarios.
-        targeted: The rollouts and the targets of each decision.
+        context: the policy's encoding of the same scenarios.
+        targeted: the rollouts with targets.
         trained: True = the agent's decisions count.
     """
     dist: TokenLogits = policy.score(context, targeted.rollouts)  # type: ignore[assignment]

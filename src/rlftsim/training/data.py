@@ -31,12 +31,12 @@ def batch_with_futures(
 
     Args:
         scenarios: Training scenarios, which the indices count.
-        indices: Indices of the scenarios, in the order of the batch.
-        context_radius_m: leave out steps farther from the ego, see `within_reach`; None = all steps.
-        mirror: indices of those that are seen mirrored.
+        indices: Indices of the scenarios of the batch, in order.
+        context_radius_m: leave out steps farther from the ego, see `within_reach`; None = keep all steps.
+        mirror: indices of the scenarios that are seen mirrored.
 
     Raises:
-        DataError: A scenario without a future, from which no model can learn.
+        DataError: a scenario withholds the future, so the model cannot learn from the scenario.
     """
     selected = [mirrored(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
     for scenario in selected:
@@ -51,17 +51,17 @@ def batch_with_futures(
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:
-    """A scenario in which a step of an agent is valid only if it is within a radius of the ego at that step.
+    """A scenario in which a step of an agent is valid only within a radius of the ego at that step.
 
-    An agent that is out of reach at the current step is not simulated. At steps where the ego is not valid
-    no step is left out.
+    An agent that is out of reach at the current step is not simulated. At steps where the ego is not valid all agents
+    stay.
 
     Args:
         scenario: Scenario with any number of logged steps.
         radius_m: 3-D distance.
 
     Returns:
-        The same object as `scenario` if all steps are within reach.
+        The same object as `scenario` where all steps are within reach.
     """
     return _without_far_steps(scenario, radius_m) or scenario
 
@@ -80,15 +80,15 @@ def _without_far_steps(scenario: Scenario, radius_m: float) -> Scenario | None:
 def trained_agents(
     batch: ScenarioBatch, update: int, *, radius_m: float, limit: int | None, seed: int
 ) -> Bool[Tensor, "B A"]:
-    """Agents whose predictions count: evaluated and interesting agents, then some near the ego, up to a limit.
+    """Agents whose predictions count: evaluated and interesting agents, then other agents near the ego, up to a limit.
 
-    Further agents need a logged future. The draw depends on the seed, the update and the scenario, not on the rest of
+    The other agents need a logged future. The draw depends on the seed, the update and the scenario, not on the rest of
     the batch.
 
     Args:
         batch: Scenarios with logged futures.
         update: counted from 0.
-        radius_m: distance from the ego at the current step up to which further agents are taken.
+        radius_m: distance from the ego at the current step up to which other agents are taken.
         limit: Largest number of trained agents in a scenario; None = no limit.
         seed: Seed of the run; equal seeds, equal choices.
     """
@@ -118,7 +118,7 @@ def trained_agents(
 
 
 def mirrored_of_update(update: int, indices: Sequence[int], probability: float, seed: int) -> set[int]:
-    """The scenarios of an update that are mirrored; each scenario has a separate draw, so processes need not agree.
+    """The scenarios of an update that are seen mirrored; each scenario draws alone, so processes need not agree.
 
     Args:
         update: counted from 0.
@@ -149,10 +149,10 @@ def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: 
 
 
 def share_cache(scenarios: Scenarios, num_processes: int) -> Scenarios:
-    """Scenarios of which each process holds a share in memory, if all would not fit.
+    """Scenarios of which each process keeps a share in memory, where the process cannot keep all.
 
     Args:
-        scenarios: Training scenarios; a list, which is in memory already, is returned unchanged.
+        scenarios: Training scenarios; a list, which is in memory already, stays unchanged.
         num_processes: Processes that share a memory.
     """
     if not isinstance(scenarios, ScenarioDataset) or num_processes == 1:

@@ -60,7 +60,7 @@ class RewardMethod(Method[FinetuneConfig]):
         return prepare(policy, settings, fabric.device, augmented)
 
     def update(self, learner: RewardLearner, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
-        """A call of `update_policy`, with messages about the outcome."""
+        """One `update_policy`, with the resulting messages."""
         config = learner.config
         values = update_policy(learner, scenarios.batch(config.num_rollouts), config, fabric)
         levels, alarms = learner.alarms.watch(values, config.alarms)
@@ -117,7 +117,7 @@ def update_policy(
 
     Args:
         learner: Policy, reference and counters, changed in place.
-        batch: This process's scenarios of the update, with logged futures.
+        batch: this process's scenarios of the update, with futures.
         config: Settings of the run; a stored run resumes only with equal settings.
         fabric: Processes of the run, and the precision of passes.
 

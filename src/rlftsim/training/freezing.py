@@ -20,10 +20,10 @@ def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[
     """The parts of a policy that are trained.
 
     Args:
-        policy: Policy that may name modules for fine-tuning.
-        trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, all weights if no part is named.
-            "head" = the last layers, named in `head_modules`. "goals" = the goal encoder only, so that agents
-            without a goal go on deciding as before. "all" = all weights.
+        policy: Policy that may name its modules for fine-tuning.
+        trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, the whole policy where no modules
+            are named. "head" = the last layers, which the policy names in `head_modules`. "goals" = the goal encoder
+            only, so that agents without a goal go on deciding as before. "all" = the whole policy.
 
     Raises:
         ConfigError: the policy is not goal-conditioned, has no part that only goals use, or names no head.
@@ -47,10 +47,10 @@ def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[
 
 
 def freeze_untrained(policy: nn.Module, trained: TrainedModules) -> None:
-    """Require a gradient of the weights that are trained, and of no further weights.
+    """Require a gradient of the weights that are trained, and of no other weights.
 
     Args:
-        policy: Policy with weights that are frozen or released in place.
+        policy: Policy whose weights are frozen or released in place.
         trained: see `select_trained_modules`.
 
     Raises:
@@ -64,7 +64,7 @@ def freeze_untrained(policy: nn.Module, trained: TrainedModules) -> None:
 
 
 def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules) -> None:
-    """Check, for an entropy bonus, that a trained weight moves the policy's entropy; fixed noise has no weight.
+    """Refuse an entropy bonus for a policy with an entropy that no trained weight moves, such as one with fixed noise.
 
     Args:
         policy: Policy to try, of which a copy decides.
@@ -72,7 +72,7 @@ def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules
         trained: see `select_trained_modules`.
 
     Raises:
-        ConfigError: An entropy of decisions without a gradient.
+        ConfigError: the entropy of the decisions has no gradient.
     """
     tried: Any = copy.deepcopy(policy).eval()
     freeze_untrained(tried, trained)
@@ -90,8 +90,8 @@ def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]
     """The weights that require a gradient, as groups for an optimizer: the goal encoder apart from all other weights.
 
     Args:
-        model: Model after `freeze_untrained`.
-        goal_scale: Learning rate of the goal encoder over the rate of all other weights.
+        model: Model whose untrained weights `freeze_untrained` has frozen.
+        goal_scale: learning rate of the goal encoder over the rate of all other weights.
     """
     goal_weights = [p for module in _goal_modules(model) for p in module.parameters() if p.requires_grad]
     # By identity: comparing tensors would compare their values.
@@ -110,7 +110,7 @@ def set_learning_rate(optimizer: Optimizer, value: float) -> None:
     """Set the learning rate of the next step.
 
     Args:
-        optimizer: Optimizer of groups that may have a "scale", see `parameter_groups`; 1 if missing.
+        optimizer: Groups may have a "scale", see `parameter_groups`; the default is 1.
         value: learning rate of a group with scale 1.
     """
     for group in optimizer.param_groups:

@@ -1,12 +1,12 @@
 """Goal relabelling (gcsl): train the goal encoder on the policy's own rollouts, relabelled with endpoints.
 
-Every rollout has endpoints. These become the goals of the agents, and the goal encoder learns to predict
-the decisions: p(token | state, endpoint). No other weight is trained, so agents without a goal go on deciding as
-before, and every rollout is an example. After goal relabelling, fine-tuning with a reward begins with agents that
+Every rollout gets somewhere. The endpoints become the goals of the agents, and the goal encoder learns to predict the
+decisions: p(token | state, endpoint). No other weights are trained, so agents without a goal go on deciding as before,
+and every rollout is an example. Fine-tuning with a reward that starts from a relabelled policy begins with agents that
 follow goals already.
 
-Source: after Ghosh et al., "Learning to Reach Goals via Iterated Supervised Learning", 2021. Here with a single round:
-the rollouts are goal-free.
+Source: after Ghosh et al., "Learning to Reach Goals via Iterated Supervised Learning", 2021. Here the method is a
+single round, with goal-free rollouts.
 """
 
 from dataclasses import dataclass, replace
@@ -80,7 +80,7 @@ class GcslMethod(ImitationMethod[GcslConfig]):
         return super().start(policy, scenarios, settings, fabric)
 
     def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
-        """Predictions along the policy's rollouts, with the endpoints as goals."""
+        """Predictions along the policy's rollouts, with endpoints as goals."""
         model, config = learner.policy, learner.config
         model.eval()  # nothing that dropout would act on is trained
         context = model.encode(batch)

@@ -2,7 +2,7 @@
 
 The methods differ in the trajectories along which a model predicts tokens: the logged tracks (pre-training), CAT-K
 rollouts, or the policy's own rollouts. The loss is the cross-entropy of the target tokens, or a loss that the policy
-brings (`ImitatedPolicy`); the sum over the whole update is divided by the number of predictions.
+brings (`ImitatedPolicy`); the sum over all scenarios of an update is divided by the number of predictions.
 """
 
 import copy
@@ -126,7 +126,7 @@ class ImitationConfig:
 
 @dataclass(eq=False, kw_only=True)
 class Imitator(Learner):
-    """A model in training, with the inputs of updates."""
+    """A model in training, with the state that updates need."""
 
     num_scenarios: int
     """Training scenarios, all of them."""
@@ -137,13 +137,13 @@ class Imitator(Learner):
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Model, average and frozen policy, if present."""
+        """Model, average and frozen policy, as far as present."""
         further = {"average": self.average, "frozen": self.frozen}
         return {**super().modules, **{name: module for name, module in further.items() if module is not None}}
 
     @property
     def result(self) -> Any:
-        """The average, if any."""
+        """The average, if there is an average."""
         return self.policy if self.average is None else self.average
 
     def finish_update(self, *, is_good: bool) -> None:
@@ -202,7 +202,7 @@ class ImitationMethod(Method[Config]):
 
         Args:
             learner: Model and settings; the update is `learner.update`.
-            batch: Scenarios with logged futures.
+            batch: Scenarios with futures.
             trained: True = the agent's predictions count.
         """
         raise NotImplementedError
@@ -317,7 +317,7 @@ def loss_along_log(
     """The model's own imitation loss, or predictions of the next token along logged tracks.
 
     Args:
-        model: PretrainablePolicy or ImitatedPolicy; the loss of the latter goes first.
+        model: PretrainablePolicy or ImitatedPolicy; the loss of an ImitatedPolicy goes first.
         batch: Scenarios with logged futures.
         trained: True = the agent's predictions count.
         update: Number of the update, from 0; draws of an own loss depend on it.
@@ -329,18 +329,18 @@ def loss_along_log(
 def accumulate_imitation(
     model: Any, batches: Sequence[ScenarioBatch], weight: float, fabric: Fabric, *, update: int, seed: int
 ) -> float:
-    """Set the model's gradient to that of `weight` times the mean pre-training loss along the log.
+    """Set the model's gradient to the gradient of `weight` times the mean pre-training loss along the log.
 
-    Goes before all other summands of the gradient: the mean is over the predictions of all processes, a number that
-    is known only when all have been made, so the accumulated gradient is scaled at the end.
+    Goes before all other additions to the gradient: the mean is over the predictions of all processes, the number of
+    which is known only at the end, so the accumulated gradient is scaled then.
 
     Args:
-        model: Model with zero gradients, in the form of `loss_along_log`.
-        batches: This process's scenarios, with logged futures; all agents with a future count.
+        model: Model with zero gradients, as `loss_along_log` takes it.
+        batches: this process's scenarios, with futures; all agents with a future count.
         weight: Weight of the loss in the objective.
         fabric: precision, and the processes that the mean is over.
         update: Number of the update, from 0.
-        seed: Seed of the draws of an own loss, together with update and process.
+        seed: Seed of the draws of an own loss; determines the draws together with update and process.
 
     Returns:
         The mean loss, nats per prediction for policies over tokens.
@@ -365,19 +365,19 @@ def accumulate_imitation(
 def summed_loss(
     prediction: Prediction, label_smoothing: float, nearby: Vocabulary | None = None, still_weight: float = 1.0
 ) -> ImitationLoss:
-    """Cross-entropy of tokens summed over predictions, nats, with the summands of the metrics.
+    """Cross-entropy of tokens summed over predictions, nats, with the sums for metrics.
 
     Args:
-        prediction: Logits and targets; only predictions in the target mask count.
+        prediction: logits and targets; only entries marked by the target mask count.
         label_smoothing: probability that the target gives to other tokens.
-        nearby: Vocabulary with tokens near the target that share the weight; None = all tokens that exist, the target
-            among them.
+        nearby: vocabulary whose tokens near the target get that probability; None = all tokens that exist, the target
+            included.
         still_weight: weight of predictions whose target is token 0, which stands still in a vocabulary; all other
             predictions count 1.
 
     Returns:
         The loss and the number of predictions; the top-1 hits, the top-5 hits and the entropy (nats) by the names of
-        the means. All are sums over predictions times weights, and zero if no prediction counts.
+        the means. All are sums over predictions times weights, and zero where no prediction counts.
     """
     logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]  # [r, V], [r]
     log_probs = functional.log_softmax(logits, -1)

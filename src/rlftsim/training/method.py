@@ -5,7 +5,7 @@ Methods are registered by name, also by other packages. In the pyproject.toml of
     [project.entry-points."rlftsim.methods"]
     nudge = "my_package:Nudge"
 
-Section and flags of the method bear this name: `rlftsim finetune --method nudge --nudge.step 1`.
+The method's section in a recipe and its flags bear this name: `rlftsim finetune --method nudge --nudge.step 1`.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -19,7 +19,6 @@ from torch import nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
-from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.batches import check_scored, micro_batches, scenario_costs
@@ -29,7 +28,7 @@ from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices, num_s
 
 @runtime_checkable
 class TrainingSettings(Protocol):
-    """Settings that every training method has: a frozen dataclass of them is stored with a run, and becomes flags."""
+    """Settings that every training method has: a frozen dataclass is stored with a run, and becomes flags."""
 
     @property
     def batch_size(self) -> int:
@@ -76,7 +75,7 @@ Settings = TypeVar("Settings", bound=TrainingSettings)
 
 @dataclass(eq=False, kw_only=True)
 class Learner:
-    """The state of a run that changes from update to update, stored in checkpoints."""
+    """The state of a run that changes from update to update, which checkpoints hold."""
 
     policy: Any
     optimizer: Optimizer
@@ -117,10 +116,10 @@ class Learner:
         """Take back the numbers of a checkpoint."""
 
     def finish(self) -> None:
-        """Make the result of the training, if the updates alone do not."""
+        """Make the result from the learned state, where the updates alone do not."""
 
     def finish_update(self, *, is_good: bool) -> None:
-        """Take the optimizer's step, or skip it, and count the update either way.
+        """Take or skip the optimizer's step, and count the update either way.
 
         Args:
             is_good: False = the gradient cannot be used; weights and moments stay.
@@ -166,7 +165,7 @@ class UpdateScenarios:
         """Indices of the scenarios of this process: a share of about equal cost.
 
         Args:
-            num_rollouts: Rollouts of each scenario, divided among processes that outnumber the scenarios.
+            num_rollouts: Rollouts of each scenario, which processes that outnumber the scenarios divide.
         """
         selected = scenarios_of_update(
             self.learner.update, self.settings.batch_size, len(self.scenarios), self.settings.seed
@@ -176,7 +175,7 @@ class UpdateScenarios:
         return local_indices(selected, self.fabric, costs, num_rollouts=num_rollouts)
 
     def batch(self, num_rollouts: int = 1) -> ScenarioBatch:
-        """All scenarios of this process as a single batch on the process's device, with logged futures.
+        """All scenarios of this process as a batch on the process's device, with futures.
 
         Args:
             num_rollouts: Rollouts of each scenario, as in `indices`.
@@ -191,7 +190,7 @@ class UpdateScenarios:
         context_radius_m: float | None = None,
         mirror_probability: float = 0.0,
     ) -> Iterator[ScenarioBatch]:
-        """Yield the scenarios of this process in batches that fit into memory, each read when needed.
+        """Yield the scenarios of this process in batches that fit into memory, each read when due.
 
         Args:
             max_count: Scenarios of a batch at most, divided among processes that share a memory.
@@ -220,7 +219,7 @@ class Method(Protocol[Settings]):
     """True = the settings have a section `validation`, and held-out scenarios may be validated on."""
 
     def describe(self, settings: Settings) -> str:
-        """The method in a few words, for the README of the models."""
+        """The method in a few words, for the README of trained models."""
         return self.title
 
     def start(self, policy: Any, scenarios: Scenarios, settings: Settings, fabric: Fabric) -> Learner:
@@ -236,7 +235,7 @@ class Method(Protocol[Settings]):
 
         Raises:
             ConfigError: The method cannot train this policy.
-            DataError: A scenario that lacks data for the method.
+            DataError: A scenario lacks what the method needs.
         """
         ...
 
@@ -249,46 +248,6 @@ class Method(Protocol[Settings]):
             fabric: Device, precision and processes; sums have to be added over the processes (`training.parallel`).
         """
         ...
-
-
-SHIPPED = {
-    "rlft": "rlftsim.training.finetune:RewardMethod",
-    "catk": "rlftsim.training.catk:CatkMethod",
-    "road": "rlftsim.training.catk:RoadMethod",
-    "gcsl": "rlftsim.training.goal_relabeling:GcslMethod",
-    "calibrate": "rlftsim.training.calibrate:CalibrateMethod",
-    "pretrain": "rlftsim.training.imitation:PretrainMethod",
-}
-"""Methods of this package, name to "module:class"."""
-METHODS: ExtensionPoint[type[Method[Any]]] = ExtensionPoint(
-    "method", "rlftsim.methods", SHIPPED, use=lambda name: method_by_name(name)
-)
-"""Training methods by name."""
-
-
-def method_by_name(name: str) -> Method[Any]:
-    """The training method of a name, installed packages included.
-
-    Raises:
-        ConfigError: Unknown, with the nearest registered name; or no training method.
-    """
-    method = METHODS.get(name)
-    missing = [member for member in ("settings", "title", "start", "update") if not hasattr(method, member)]
-    if missing:
-        raise ConfigError(
-            f"method {name!r} has no {' and no '.join(missing)}: make it extend rlftsim.training.method.Method."
-        )
-    return method()
-
-
-def find_method(settings: object) -> Method[Any] | None:
-    """The training method of settings, by type; None for settings of no method."""
-    # Methods of other packages come last: a look at them imports all these packages.
-    for list_names in (lambda: list(SHIPPED), METHODS.names):
-        for name in list_names():
-            if getattr(METHODS.get(name), "settings", None) is type(settings):
-                return method_by_name(name)
-    return None
 
 
 def check_trainable(

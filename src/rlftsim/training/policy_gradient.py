@@ -3,7 +3,7 @@
 Every term is a sum over the agents and decisions of this process and slice, divided by a global count. So slices of the
 rollouts, micro batches and processes add up to the same estimator.
 
-Source: RLFTSim, section 4.1; the adaptive penalty is that of Ziegler et al., "Fine-Tuning Language Models from Human
+Source: RLFTSim, section 4.1; the adaptive penalty is from Ziegler et al., "Fine-Tuning Language Models from Human
 Preferences", 2020.
 """
 
@@ -66,7 +66,7 @@ def masked_sum(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) ->
 
 @dataclass(frozen=True)
 class LossTerms:
-    """Coefficients of the fine-tuning loss in an update, and the global counts that sums are divided by."""
+    """Coefficients of the fine-tuning loss in one update, and the global counts that sums are divided by."""
 
     num_scenarios: int
     num_decisions: float
@@ -80,7 +80,7 @@ class LossTerms:
 
 @dataclass(frozen=True, eq=False)
 class GradientSums:
-    """Statistics of a pass over the rollouts, beside the gradients in the parameters."""
+    """Statistics of a pass over the rollouts, beside the gradients that the pass leaves in the parameters."""
 
     kl: float
     """From the reference, nats per decision; mean over all processes."""
@@ -110,10 +110,10 @@ def accumulate_gradients(
     policy_gradient_loss + (beta * KL - entropy_bonus * entropy) / decisions + imitation_weight * pre-training loss.
 
     Args:
-        policy: Policy that scores the rollouts with gradient; gradients are zero before.
-        reference: Policy that scores without gradient; under the same goals, unless the setting
+        policy: scores the rollouts with gradient; gradients are zero before.
+        reference: scores the rollouts without gradient; under the same goals, unless the setting
             `kl.condition_reference` is False. A reference whose goal encoder was added for this run is still goal-free;
-            an already conditioned reference anchors the policy to earlier goal-following.
+            an already conditioned reference anchors the policy to the reference's goal-following.
         experiences: Rollouts of this process with rewards, an entry per micro batch.
         terms: Coefficients of the loss, and the global counts that sums are divided by.
         fabric: precision, and the processes that the statistics are summed over.

@@ -1,4 +1,4 @@
-"""Several processes on a CPU: forked from the training process, and connected by pipes.
+"""Several processes on a CPU: forked from the training process, and connected with that process by pipes.
 
 Forked processes share the memory of this process, and start in milliseconds. So a script needs no main guard, a
 notebook may train with the rewards and policies that cells define, and scenarios that have been read are shared.
@@ -27,13 +27,14 @@ from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabr
 
 @contextmanager
 def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> Iterator[Fabric]:
-    """Start the processes of a run, and yield the fabric of this process, which has rank 0.
+    """Start the processes of a run, and yield the fabric of this process, which has rank 0, for a share of the work.
 
-    On a CPU the other processes are forked here, and call the function. These print no text, write no files, and end
-    with the `with`, also with an error, Ctrl-C, or a kill of this process. Errors of forked processes are raised here.
+    On a CPU the other processes are forked here, and call the function. The forked processes print no text, write no
+    files, and end with the `with`, also with an error, Ctrl-C, or a kill of this process. Errors of forked processes
+    are raised here.
 
     Args:
-        work: Function that the other processes call, each with a separate fabric.
+        work: Function that the other processes call, each with the fabric of the calling process.
         config: Device settings with a number of processes, not "auto".
 
     Raises:
@@ -109,7 +110,7 @@ class LostProcessError(DataError):
 
 @dataclass(frozen=True, eq=False)
 class LinkedProcess:
-    """A process among several on a CPU, as a `Fabric`."""
+    """A process of several on a CPU, as a `Fabric`."""
 
     alone: Fabric
     """Device and precision."""
@@ -144,7 +145,7 @@ class LinkedProcess:
             reduce_op: "sum".
 
         Raises:
-            LostProcessError: A process that died.
+            LostProcessError: a process died.
         """
         assert reduce_op == "sum"
         if not self.is_global_zero:

@@ -46,7 +46,7 @@ class KlConfig:
 
 @dataclass(eq=False, kw_only=True)
 class RewardLearner(Learner):
-    """A policy in fine-tuning with a frozen reference, the KL penalty's strength and the alarms."""
+    """A policy in fine-tuning with the frozen reference, the KL penalty's strength and the alarms."""
 
     reference: Any
     beta: float

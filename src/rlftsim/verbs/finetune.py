@@ -24,7 +24,7 @@ from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.method import find_method
+from rlftsim.training.registry import find_method
 from rlftsim.training.run import train_policy
 from rlftsim.verbs.inputs import to_policy
 

@@ -190,7 +190,7 @@ def generate(
     with Lease(shards / ".lock", runner, "makes scenarios in") as lease:
         paths = run_items(
             "synthetic scenarios", tasks, partial(_write_shard, shards), lease=lease, runner=runner,
-            format=WholeFiles(shards, attrgetter("shard_name"), attrgetter("num_scenarios")),
+            format=WholeFiles(shards, attrgetter("shard_name"), ShardReader, attrgetter("num_scenarios")),
             show_progress=show_progress,
         )  # fmt: skip
         remove_temporaries_below(folder)  # of processes that were killed
