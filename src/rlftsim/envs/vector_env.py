@@ -172,7 +172,7 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError("these environments have no episodes yet: call reset() first.")
         controls = self.source.controls
         # all slots before any of them moves
-        actions = validate_actions(actions, controls, self._name_of, self.num_envs)
+        actions = validate_actions(actions, controls, self._describe_slot, self.num_envs)
         over = np.flatnonzero(self._over)
         if self.autoreset_mode == AutoresetMode.DISABLED and len(over):
             raise ConfigError(f"the episode of slot {over[0]} is over: reset it with options={{'reset_mask': ...}}.")
@@ -208,7 +208,7 @@ class EgoVectorEnv(VectorEnv):
                 notes[slot] |= {"final_obs": final_observation, "final_info": final[slot]}
         return self._observe(), rewards, terminated, truncated, notes
 
-    def _name_of(self, slot: int) -> str:
+    def _describe_slot(self, slot: int) -> str:
         group = next(group for group in self._groups if slot in group.slots)
         return f"slot {slot}, {group.episode.agent_name(int(np.flatnonzero(group.slots == slot)[0]))}"
 

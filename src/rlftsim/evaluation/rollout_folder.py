@@ -1,6 +1,6 @@
-"""Folder of rollouts: a file for each scenario, and the description that keeps two models out of it.
+"""Folder of rollouts: a file for each scenario, and a description that keeps a second model out.
 
-An interrupted simulation goes on where it was stopped; files that are damaged or cut off are made again.
+An interrupted simulation goes on; files that are damaged or cut off are made again.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ ABOUT = "rollouts.json"
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Rollouts that are to be made; is handed to other processes."""
+    """Input of a simulation; is handed to worker processes."""
 
     policy: Policy
     scenarios: ScenarioDataset
@@ -43,7 +43,7 @@ class Simulation:
     goals: GoalsFile = GoalsFile(())  # noqa: RUF009 (frozen)
 
     def describe(self, model: str) -> dict[str, Any]:
-        """Values on which the rollouts depend, as JSON has them, and the name of the model, which may change."""
+        """Values on which the rollouts depend, in types of JSON, and the name of the model, which may change."""
         identity = {
             "model": model,
             "policy": fingerprint_policy(self.policy),
@@ -59,7 +59,7 @@ class Simulation:
 def simulate_folder(
     simulation: Simulation, scenario_ids: Sequence[str], out: Path, *, model: str, runner: Runner
 ) -> list[Path]:
-    """Simulate the scenarios that have no whole file yet; returns the files of all.
+    """Simulate the scenarios that have no complete file yet; returns the files of all.
 
     Args:
         simulation: Policy, data and settings, which must be those of the rollouts that are in the folder.
@@ -69,9 +69,9 @@ def simulate_folder(
         runner: Runner of the work; changes no result.
 
     Raises:
-        ConfigError: The folder holds rollouts of another model or other settings.
-        DataError: A damaged description, or a folder of another type of result.
-        NotYetError: Another driver is at work in the folder.
+        ConfigError: A folder of rollouts of a second model or other settings.
+        DataError: A damaged description, or a folder of a different type of result.
+        NotYetError: A second driver at work in the folder.
         SetAside, Unfinished: See `run_items`.
     """
     identity = simulation.describe(model)
@@ -119,15 +119,15 @@ def _simulate_scenario(
 
 
 def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool = True) -> None:
-    """Check that a folder holds no rollouts but those of a description.
+    """Check that a folder holds only the rollouts of a description.
 
     Args:
         folder: Folder of the rollouts; may be missing.
         identity: Description of the work, by the names of its settings.
-        is_alone: False where other shares may be at work, whose description stands before their first rollouts do.
+        is_alone: False where other shares may be at work, with a description and no rollouts yet.
 
     Raises:
-        ConfigError: Rollouts of another model or other settings, or a share that makes such.
+        ConfigError: Rollouts of a second model or other settings, or a share that makes such rollouts.
         DataError: A damaged description.
     """
     path = folder / ABOUT

@@ -13,7 +13,7 @@ def summarize_docstring(documented: object) -> str:
 
 
 def read_field_texts(config: type) -> dict[str, str]:
-    """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
+    """Docstrings below the fields of a dataclass, inherited fields included, each on a single line."""
     documentation: dict[str, str] = {}
     for owner in reversed(config.__mro__):
         if not is_dataclass(owner):

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlftsim.errors import RlftsimError, place_of
+from rlftsim.errors import RlftsimError, locate_error
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.edge_scenes import (
@@ -131,7 +131,7 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         except _Broken as error:
             outcome, detail = "failed", str(error)
         except Exception as error:  # whatever a policy raises is an outcome of the test
-            outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({place_of(error)})"
+            outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({locate_error(error)})"
         results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
     return CheckReport(type(policy).__name__, tuple(results))
 
