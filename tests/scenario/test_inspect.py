@@ -91,7 +91,6 @@ def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, mo
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
-        ({"timestamps_s": None}, "timestamps are None, not one number for each step"),
         ({"timestamps_s": np.arange(91.0)}, "step 1 is 1.000 s after step 0 instead of 0.1 s: steps must be"),
         (
             {"tracks_to_predict": np.array([1, 1], np.int32), "difficulty": np.zeros(2, np.int8)},
@@ -238,3 +237,10 @@ def test_stats_of_an_empty_data_set_are_zeros(tmp_path):
     write_index_and_manifest(tmp_path / "empty", [])  # as a conversion writes it that loses every record
     stats = dataset_stats(tmp_path / "empty")
     assert (stats.num_scenarios, stats.mean_agents, stats.speeds) == (0, 0.0, {})
+
+
+def test_timestamps_that_are_no_list_are_named(make_message):
+    scenario = scenario_from_bytes(make_message("a").SerializeToString())
+    object.__setattr__(scenario, "timestamps_s", None)  # as a damaged shard has them
+    with pytest.raises(DataError, match="timestamps are None, not one number for each step"):
+        scenario.check_consistency()
