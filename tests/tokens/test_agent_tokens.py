@@ -92,14 +92,6 @@ def test_each_token_corrects_the_error_of_the_last(built, pack_scenarios):
     assert max(by_step) < radius_m  # 18 errors that added up would be many disks away
 
 
-def test_where_no_token_leads_the_log_is_followed(vocabulary):
-    backwards = track(np.stack([-0.5 * np.arange(91), np.zeros(91)], -1))  # 5 m/s, faces the other way
-    tokens = tokenize_tracks(backwards, VEHICLE, vocabulary)
-    torch.testing.assert_close(tokens.position, tokens.logged_position)
-    rolled = tokenize_tracks(backwards, VEHICLE, vocabulary, max_error_m=math.inf)
-    assert (rolled.position - rolled.logged_position).norm(dim=-1).max() > 40
-
-
 def test_the_nearest_token_is_nearest_by_corners(vocabulary):
     motion = track([[0.0, 0.0]] * 5 + [[3.07, 0.04]])
     tokens = tokenize_tracks(motion, VEHICLE, vocabulary)

@@ -20,9 +20,6 @@ from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, box_of_class,
 HISTORY_TOKENS = 2
 """Token steps up to the current step."""
 MAX_HEADING_STEP_RAD = 1.5
-MAX_ERROR_M = 0.3
-"""Mean distance of the corners from the log up to which tokens roll on, so that a simulation begins where the log ends.
-Ordinary motions stay below 0.18 m; beyond are those that no token makes, such as backing up."""
 _ROWS_PER_CHUNK = 512
 _ROWS_PER_CHUNK_ELSEWHERE = 1 << 12
 _CANDIDATES = 64
@@ -45,8 +42,7 @@ class AgentTokens:
 
     token_id: Int64[Tensor, "B A K"]
     position: Float[Tensor, "B A K 2"]
-    """End points of the matched tokens, not of the log: each token corrects the error of the token before. Where that
-    fails, by more than `MAX_ERROR_M`, the logged pose."""
+    """End points of the matched tokens, not of the log: each token corrects the error of the token before."""
     heading: Float[Tensor, "B A K"]
     valid: Bool[Tensor, "B A K"]
     logged_position: Float[Tensor, "B A K 2"]
@@ -145,12 +141,7 @@ def class_boxes(object_type: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."]
 
 
 def tokenize_tracks(
-    tracks: CleanTracks,
-    object_type: Int64[Tensor, "B A"],
-    vocabulary: Vocabulary,
-    *,
-    catk_compat: bool = False,
-    max_error_m: float = MAX_ERROR_M,
+    tracks: CleanTracks, object_type: Int64[Tensor, "B A"], vocabulary: Vocabulary, *, catk_compat: bool = False
 ) -> AgentTokens:
     """Rolling matching: at each step the token that ends nearest to the log, from the end of the token before.
 
@@ -159,22 +150,18 @@ def tokenize_tracks(
         object_type: WOMD's object type of each agent, which decides on the class.
         vocabulary: Motion tokens of each class.
         catk_compat: True = round where the public code rounds, by the rules of `tokens.catk_compat`.
-        max_error_m: Mean distance of the corners from the log beyond which a pose is the logged one, m.
     """
-    # 1. The pose rolls along with the matched tokens; where there is no token, or none near, it restarts from the log.
+    # 1. The pose rolls along with the matched tokens; where there is no token it restarts from the log.
     match = _match_placed if catk_compat else _match_in_local_frame
     class_id = class_of_type(object_type)
-    size = class_boxes(object_type)
     position, heading = tracks.position[..., 0, :], tracks.heading[..., 0]
     columns: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for end in range(STEPS_PER_TOKEN, tracks.valid.shape[-1], STEPS_PER_TOKEN):
         valid = tracks.valid[..., end - STEPS_PER_TOKEN] & tracks.valid[..., end]
         logged_pose = tracks.position[..., end, :], tracks.heading[..., end]
         token_id, end_position, end_heading = match(logged_pose, (position, heading), class_id, valid, vocabulary)
-        corners = box_corners(end_position, end_heading, *size) - box_corners(*logged_pose, *size)
-        goes_on = valid & (corners.norm(dim=-1).mean(-1) <= max_error_m)
-        position = torch.where(goes_on[..., None], end_position, logged_pose[0])
-        heading = torch.where(goes_on, end_heading, logged_pose[1])
+        position = torch.where(valid[..., None], end_position, logged_pose[0])
+        heading = torch.where(valid, end_heading, logged_pose[1])
         columns.append((token_id, position * valid[..., None], heading * valid, valid))
     # 2. Columns to tensors [B, A, K].
     token_id, position, heading, valid = (torch.stack(column, 2) for column in zip(*columns))

@@ -1,6 +1,5 @@
 """Coverage: the error of any vocabulary on the motions of a data set. Memory does not grow with the data."""
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +11,7 @@ from rlftsim.geometry import box_corners, wrap_angle
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import STEP_S, Scenario, Scenarios
-from rlftsim.tokens.agent_tokens import class_boxes, clean_tracks, nearest_rows, tokenize_tracks
+from rlftsim.tokens.agent_tokens import class_boxes, nearest_rows, tokenize_agents
 from rlftsim.tokens.motions import Motions, end_boxes, extract_motions, is_plausible, mirror_poses, sample_scenarios
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
@@ -196,8 +195,7 @@ def _add_motions(classes: tuple[ClassCoverage, ...], motions: Motions, vocabular
 def _add_tracks(classes: tuple[ClassCoverage, ...], scenario: Scenario, vocabulary: Vocabulary) -> None:
     """Add the whole tracks of a scenario, rolling."""
     batch = collate([scenario])
-    # Without restarts from the log: they would hide what the vocabulary lacks.
-    tokens = tokenize_tracks(clean_tracks(batch), batch.object_type, vocabulary, max_error_m=math.inf)
+    tokens = tokenize_agents(batch, vocabulary)
     length, width = (side[..., None].expand(tokens.valid.shape) for side in class_boxes(batch.object_type))
     # Boxes where the tokens end and where the log is [1, A, K, 4, 2].
     token_boxes = box_corners(tokens.position, tokens.heading, length, width)
