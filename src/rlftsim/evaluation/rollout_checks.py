@@ -143,6 +143,7 @@ class PoseChecks:
         if is_moving.any() and (poses[:, is_moving, :2] == poses[:1, is_moving, :2]).all():
             yield Doubt("equal", f"all {len(poses)} rollouts are equal: the metric compares distributions")
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _facing_doubts(self) -> Iterator[Doubt]:
         """Doubt that most agents face as in the log, or else along their motion; backing up is along it."""
         x, y, _, heading = np.moveaxis(self.poses, 2, 0)  # each [N, A, T]

@@ -283,7 +283,8 @@ class Lease:
             # A full disk may have kept the beginning alone.
             if not (text.startswith(stored := _read_lock(file)) or _OWNER.search(stored)):
                 raise DataError(f"{path} is no lock of `rlftsim`: rename it, or choose another folder.")
-            file.truncate(0)
+            file.seek(0)
+            file.truncate()
             file.write(text)
             file.flush()
 

@@ -103,11 +103,11 @@ def _make_updates(
     Ctrl-C waits for the end of an update, which becomes a checkpoint.
     """
     scenarios = share_cache(scenarios, num_sharing_memory(fabric))
-    learner = method.start(policy, scenarios, settings, fabric)
-    update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     validation: ValidationConfig | None = None if held_out is None else settings.validation
     if held_out is not None and validation is not None and validation.every:
         check_validation(policy, held_out, validation)
+    learner = method.start(policy, scenarios, settings, fabric)
+    update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     with _hold_folder(out, fabric):
         run = TrainingRun(method.title, policy, scenarios, out, settings, learner, fabric)
         run.resume()
