@@ -369,6 +369,11 @@ def test_dropout_changes_no_simulation(home, data):
     first, again, still = (rs.simulate(one, data[0], num_rollouts=2) for one in (policy, policy, policy.eval()))
     assert torch.equal(first.position, again.position)
     assert torch.equal(first.position, still.position)
+    in_files = [rs.simulate(one, data, num_rollouts=2, out=home / name, limit=1)[0].read_bytes()
+                for one, name in ((policy.train(), "training"), (policy.eval(), "evaluated"))]  # fmt: skip
+    assert in_files[0] == in_files[1]
+    with pytest.raises(ConfigError, match="limit"):
+        rs.simulate(policy, data, out=home / "none", limit=0)
     with pytest.raises(ConfigError, match=r"policy is in training mode, .* call policy\.eval\(\)"):
         Source(EnvConfig(), list(data), policy.train())
 

@@ -69,6 +69,11 @@ def shorten(text: str, most: int = MAX_MESSAGE) -> str:
         gap = f" ... {len(text) - most} characters and more ... "
         half = (most - len(gap)) // 2
         text = text[:half] + gap + text[-half:]
+    return printable(text)
+
+
+def printable(text: str) -> str:
+    """A text with a space in place of each sign that no terminal shows, such as an end of line."""
     return "".join(sign if sign.isprintable() else " " for sign in text)
 
 

@@ -13,7 +13,10 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.registry import METHODS, method_by_name
+from rlftsim.training.catk import CatkConfig, CatkMethod
+from rlftsim.training.finetune import RewardMethod
+from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.training.run_folder import read_metrics
 from third_party import installed
 
@@ -82,3 +85,14 @@ def test_a_class_that_is_no_method_is_refused_with_what_it_lacks(monkeypatch):
     monkeypatch.setattr(METHODS, "_registered", {"half": type("Half", (), {"settings": None, "title": "half"})})
     with pytest.raises(ConfigError, match="method 'half' has no start and no update: make it extend"):
         method_by_name("half")
+
+
+def test_settings_of_a_derived_class_choose_the_method_of_the_nearest_base(package):
+    class Gentle(FinetuneConfig):
+        """Settings of a user's own."""
+
+    class Gradual(CatkConfig):
+        """Others."""
+
+    assert [type(find_method(settings)) for settings in (Gentle(), Gradual())] == [RewardMethod, CatkMethod]
+    assert find_method(None) is None

@@ -278,6 +278,14 @@ def test_a_lock_that_a_clock_or_disk_has_spoiled_is_refused_in_one_line(tmp_path
             Lease(tmp_path / "lock", Inline(), "works in")
 
 
+def test_the_lock_of_the_share_that_finishes_is_text_without_gaps(tmp_path):
+    with Lease(tmp_path / ".lock", Share(1, 2, Inline()), "works in", note="In work.") as lease:
+        lease.finish("work")
+        text = (tmp_path / ".lock").read_text()
+    assert text.startswith("In work.\n")
+    assert "\0" not in text
+
+
 @pytest.mark.parametrize("runner", [Inline(), Share(1, 2, Inline())])
 @pytest.mark.parametrize("text", [b"of the user\n", b"\xff\xfe", b"\nlocal notes since 2020-01-01T00:00:00\n"])
 def test_a_file_of_the_user_with_the_name_of_the_lock_stays(text, runner, tmp_path):

@@ -76,12 +76,12 @@ class PairedDifference:
         return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Comparison:
     """Two evaluations, scenario by scenario; `comparison["meta_metric"]` is the difference of a column."""
 
-    name_a: str
-    name_b: str
+    a: Evaluation
+    b: Evaluation
     num_paired: int
     num_only_a: int
     """Scenarios that only the first has; they are left out."""
@@ -92,7 +92,7 @@ class Comparison:
     """Street networks or recordings that the paired scenarios are of; 0 = each scenario stands for itself."""
 
     def __repr__(self) -> str:
-        return f"{self.name_b} against {self.name_a}, {self.pairing}; {self['meta_metric']!r}"
+        return f"{self.b.name} against {self.a.name}, {self.pairing}; {self['meta_metric']!r}"
 
     def __getitem__(self, column: str) -> PairedDifference:
         """Difference of a column.
@@ -109,7 +109,7 @@ class Comparison:
     @property
     def pairing(self) -> str:
         """Numbers of scenarios that are compared and left out, in words."""
-        alone = [(self.num_only_a, self.name_a), (self.num_only_b, self.name_b)]
+        alone = [(self.num_only_a, self.a.name), (self.num_only_b, self.b.name)]
         left_out = "".join(f", {count} only in {name} left out" for count, name in alone if count)
         with_rmm = _with_rmm(self["meta_metric"].count, self.num_paired)
         clusters = f" of {self.num_clusters} cluster{'s' if self.num_clusters > 1 else ''}" if self.num_clusters else ""
@@ -159,7 +159,7 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     differences = tuple(compare_values(c, a.values(c)[rows_a], b.values(c)[rows_b]) for c in SCORE_COLUMNS)
     num_paired = len(rows_a)
     return Comparison(
-        a.name, b.name, num_paired, len(a) - num_paired, len(b) - num_paired, differences, num_clusters=num_clusters
+        a, b, num_paired, len(a) - num_paired, len(b) - num_paired, differences, num_clusters=num_clusters
     )
 
 
@@ -280,13 +280,13 @@ def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TER
         columns: Columns of evaluations, in the order of the rows.
     """
     table = Table(
-        title=f"{comparison.name_b} against {comparison.name_a}: {comparison.pairing}",
+        title=f"{comparison.b.name} against {comparison.a.name}: {comparison.pairing}",
         title_justify="left",
         caption=comparison.caution or None,
         caption_justify="left",
     )
     table.add_column("", no_wrap=True)
-    for name in (comparison.name_a, comparison.name_b, "difference"):
+    for name in (comparison.a.name, comparison.b.name, "difference"):
         table.add_column(name, justify="right")
     table.add_column("verdict")
     for column in columns:

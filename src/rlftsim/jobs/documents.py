@@ -12,7 +12,7 @@ from collections.abc import Callable
 from os import PathLike, fstat
 from typing import Any
 
-from rlftsim.errors import DataError, RlftsimError
+from rlftsim.errors import DataError, RlftsimError, printable
 
 MAX_TEXT_BYTES = 64 << 20
 """Largest text that is parsed; the largest that this package writes is the manifest of a data set, some MB."""
@@ -146,11 +146,6 @@ def first_line(problem: BaseException) -> str:
     text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
     line = text.strip().splitlines()[0].rstrip(".")[:200] if text.strip() else type(problem).__name__
     return printable(line)
-
-
-def printable(text: str) -> str:
-    """A text with a space in place of each sign that no terminal shows, such as an end of line."""
-    return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
 def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError]) -> bytes:

@@ -21,7 +21,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from rlftsim.jobs.documents import printable
+from rlftsim.errors import printable
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200

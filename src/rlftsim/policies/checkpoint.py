@@ -23,9 +23,9 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.errors import CheckpointError, ConfigError, printable
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.documents import printable, read_json
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
 

@@ -108,12 +108,11 @@ def finetune_model(
     Args:
         base: model folder, or the folder of a run.
         training: Training scenarios of a single data set, with logged futures.
-        config: settings: `FinetuneConfig` for a reward, `CatkConfig` for CAT-K, `GcslConfig` for imitation of the
-            model's own rollouts, relabelled with endpoints as goals.
+        config: Settings of a training method, such as `FinetuneConfig` for a reward or `CatkConfig` for CAT-K.
         out: Folder of the run. A run that was stopped there is resumed, a finished run is not repeated; with a reward
             and more epochs it is trained further.
         conditioning: goal conditioning to add to the base model first; None = as the base model is.
-        held_out: scenarios for validation; CAT-K only, see `config.validation`.
+        held_out: Scenarios for validation, for methods whose settings have a section `validation`.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or a different base model.

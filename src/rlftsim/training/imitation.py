@@ -8,6 +8,7 @@ brings (`ImitatedPolicy`); the sum over all scenarios of an update is divided by
 import copy
 import math
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -195,6 +196,7 @@ class ImitationMethod(Method[Config]):
             policy=policy, optimizer=optimizer, config=settings, num_scenarios=len(scenarios), average=average
         )
 
+    @abstractmethod
     def predict(
         self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]
     ) -> Prediction | ImitationLoss:
@@ -205,7 +207,6 @@ class ImitationMethod(Method[Config]):
             batch: Scenarios with futures.
             trained: True = the agent's predictions count.
         """
-        raise NotImplementedError
 
     def update(self, learner: Imitator, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
         """An optimizer step along the trajectories of the method."""

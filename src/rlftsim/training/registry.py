@@ -37,10 +37,11 @@ def method_by_name(name: str) -> Method[Any]:
 
 
 def find_method(settings: object) -> Method[Any] | None:
-    """The training method of settings, by type; None for settings of no method."""
-    # Methods of other packages come last: a look at them imports all these packages.
-    for list_names in (lambda: list(SHIPPED), METHODS.names):
-        for name in list_names():
-            if getattr(METHODS.get(name), "settings", None) is type(settings):
-                return method_by_name(name)
+    """The training method of settings, by type or else by the nearest base class; None for settings of no method."""
+    for settings_type in type(settings).__mro__:
+        # Methods of other packages come last: a look at them imports all these packages.
+        for list_names in (lambda: list(SHIPPED), METHODS.names):
+            for name in list_names():
+                if getattr(METHODS.get(name), "settings", None) is settings_type:
+                    return method_by_name(name)
     return None

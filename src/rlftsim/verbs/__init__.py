@@ -1,1 +1,1 @@
-"""Verbs: each is a function that is `rs.NAME` and `rlftsim NAME`, with one signature and one text for both."""
+"""Verbs: a function each, with one signature and one text for Python and the command line, or for one of the two."""

@@ -49,16 +49,14 @@ def _read(result: Any, kind: Any) -> Any:
     return result
 
 
-def print_comparison(comparison: Comparison | DriveComparison, *, a: Result, b: Result) -> None:
+def print_comparison(comparison: Comparison | DriveComparison) -> None:
     """Print the means of both results, and their differences.
 
     Args:
-        comparison: Differences of the two results.
-        a: The reference, see `compare`.
-        b: The other result.
+        comparison: Both results with their differences.
     """
     if isinstance(comparison, DriveComparison):
         print_wide(format_drives(comparison.a, comparison.b), format_drive_comparison(comparison))
         return
-    evaluations = _read(a, Evaluation), _read(b, Evaluation)
+    evaluations = comparison.a, comparison.b
     print_wide(format_table(*evaluations), format_comparison(comparison, columns=select_columns(*evaluations)))

@@ -1,4 +1,4 @@
-"""Public `recipe`, `pretrain` and `finetune`: training that leaves the given policy as it is."""
+"""Public `pretrain` and `finetune`: training that leaves the given policy as it is."""
 
 import copy
 import os
@@ -106,9 +106,10 @@ def finetune(
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
         NotYetError: another run is at work in `out`.
     """
-    if isinstance(config, PretrainConfig) or find_method(config) is None:
-        _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
-    training, settings = to_scenarios(scenarios, "training"), config or FinetuneConfig()
+    settings = config or FinetuneConfig()
+    if isinstance(settings, PretrainConfig) or find_method(settings) is None:
+        _require_config(settings, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
+    training = to_scenarios(scenarios, "training")
     card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
     start = prepare_policy(to_policy(policy), settings)
     return _train_copy(start, out, lambda learner, folder: train_policy(learner, training, folder, settings, card=card))

@@ -60,8 +60,9 @@ def list_plug_ins() -> list[PlugIn]:
 def plugins() -> int:
     """List what other installed packages add, with package and version, and the reason where one fails.
 
-    Each is tried out, of rewards, policies, data sources, recipes, experiments, planners and exporters: policies,
-    planners and recipes are made. The exit status is 1 if one fails. The others are used all the same.
+    Each is tried out, of rewards, policies, training methods, data sources, recipes, experiments, planners and
+    exporters: policies, planners and recipes are made. The exit status is 1 if one fails. The others are used all the
+    same.
     """
     plug_ins = list_plug_ins()
     if not plug_ins:

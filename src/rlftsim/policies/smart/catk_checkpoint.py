@@ -12,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.errors import CheckpointError, ConfigError, printable
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.documents import printable
 from rlftsim.jobs.files import save_tensors
 from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
 from rlftsim.policies.smart.catk_keys import PREFIX, catk_name, find_aliases
