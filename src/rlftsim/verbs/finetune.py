@@ -106,7 +106,7 @@ def finetune(
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
         NotYetError: another run is at work in `out`.
     """
-    settings = config or FinetuneConfig()
+    settings = FinetuneConfig() if config is None else config
     if isinstance(settings, PretrainConfig) or find_method(settings) is None:
         _require_config(settings, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training = to_scenarios(scenarios, "training")
