@@ -21,14 +21,15 @@ from pathlib import Path
 import rlftsim
 from rlftsim import errors
 from rlftsim.cli.main import OVERVIEW, VERBS, main
-from rlftsim.cli.mistakes import ACTIONS
+from rlftsim.docstrings import read_field_texts, summarize_docstring
 from rlftsim.plugins import is_ours
 from rlftsim.recipes.registry import RECIPES
-from rlftsim.recipes.settings import field_documentation, list_sections, summarize_docstring
+from rlftsim.recipes.settings import list_sections
 from rlftsim.training.run_folder import to_plain
 from rlftsim.verbs.plugins import POINTS
 
 ROOT = Path(__file__).resolve().parents[1]
+ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
 REFERENCE = ROOT / "build" / "pages" / "reference"
 PACKAGE = ROOT / "src" / "rlftsim"
 CONFIGS = {
@@ -155,7 +156,7 @@ def fields_page() -> str:
 
 def settings_of(config: object, prefix: str = "") -> Iterator[tuple[str, tuple[object, str]]]:
     """Dotted name, value and documentation of each field of a dataclass."""
-    documentation = field_documentation(type(config))
+    documentation = read_field_texts(type(config))
     for field in fields(config):
         value, name = getattr(config, field.name), f"{prefix}{field.name}"
         if is_dataclass(value):

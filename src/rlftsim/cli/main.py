@@ -17,13 +17,6 @@ from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 
-OLD_COMMANDS = {
-    "tokens": "rlftsim.cli.tokens:Tokens",
-    "pretrain": "rlftsim.cli.train:Pretrain",
-    "finetune": "rlftsim.cli.train:Finetune",
-    "experiment": "rlftsim.cli.experiment:RunExperiment",
-}
-"""Module and class of each verb that is no function yet."""
 VERBS = (
     "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "augment",
     "model", "goals", "simulate", "drive", "studio", "score", "evaluate", "compare", "submit", "experiment",
@@ -129,8 +122,8 @@ def parse(words: Sequence[str]) -> Any:
     """The verb of a command line with its settings; has a method `run`.
 
     Raises:
-        ConfigError: the words make no sense.
-        SystemExit: they ask for help, which has been printed.
+        ConfigError: The words make no sense.
+        SystemExit: They ask for help, which has been printed.
     """
     # Imported late: the overview is printed without it.
     from rlftsim.cli.parse import parse as parse_words

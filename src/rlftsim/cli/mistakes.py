@@ -5,14 +5,9 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
+from rlftsim.verbs.commands import FLAG, list_flags
+
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
-FLAG = re.compile(r"--[A-Za-z][\w.-]*")
-ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
-
-
-def flags_of(words: Sequence[str]) -> list[str]:
-    """Flags among words, without their values, as help texts write them."""
-    return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
 
 
 def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
@@ -33,15 +28,12 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     """One line that says what is wrong with a command line.
 
     Args:
-        words: the words behind the verb.
-        complaint: what tyro printed, a box of lines.
-        help_text: the verb's help, for the flags that exist.
+        words: Words behind the verb.
+        complaint: Output of tyro, a box of lines.
+        help_text: Help of the verb, for the flags that exist.
     """
-    actions = ACTIONS.search(help_text)
-    if actions and words and not words[0].startswith("-"):
-        return explain_action(words, actions[1].split(","))
     known = list(dict.fromkeys(FLAG.findall(help_text)))
-    for flag in flags_of(words):
+    for flag in list_flags(words):
         if flag not in known:
             near = nearest(flag, known)
             return f"no flag {flag}: " + (f"did you mean {near}?" if near else "`--help` lists them all.")
@@ -59,8 +51,8 @@ def nearest(flag: str, known: Sequence[str]) -> str | None:
     """The known flag that a mistyped one most likely stands for; None = none is near.
 
     Args:
-        flag: e.g. "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".
-        known: flags that exist.
+        flag: Mistyped flag, such as "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".
+        known: Flags that exist.
     """
     group, _, last = flag.removeprefix("--").rpartition(".")
     siblings = [name for name in known if name.removeprefix("--").rpartition(".")[0].startswith(group)]

@@ -1,17 +1,15 @@
 """Settings as text: a recipe printed with its documentation, and files of settings read back as flags."""
 
-import ast
 import difflib
-import inspect
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from rlftsim.docstrings import read_field_texts, summarize_docstring
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.documents import read_json
 from rlftsim.recipes.base import SECTIONS, Recipe, section_names
@@ -36,13 +34,8 @@ def list_sections(recipe: Recipe) -> dict[str, Any]:
     return {name: getattr(recipe, name) for name in section_names(recipe)}
 
 
-def summarize_docstring(documented: object) -> str:
-    """First sentence or line of a docstring."""
-    return (inspect.getdoc(documented) or "").partition("\n")[0]
-
-
 def _write_lines(section: Any, indent: str) -> Iterator[str]:
-    documentation = field_documentation(type(section))
+    documentation = read_field_texts(type(section))
     for field in fields(section):
         value = getattr(section, field.name)
         # A section without a docstring of its own is described by its class.
@@ -55,33 +48,17 @@ def _write_lines(section: Any, indent: str) -> Iterator[str]:
             yield f"{indent}{field.name}: {json.dumps(to_plain(value))}"
 
 
-def field_documentation(config: type) -> dict[str, str]:
-    """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
-    documentation: dict[str, str] = {}
-    for owner in reversed(config.__mro__):
-        if not is_dataclass(owner):
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
-        # A field's docstring is the string that follows it; at run time it is gone, so the source is read.
-        for statement, following in pairwise(body):
-            if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
-                continue
-            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
-                documentation[statement.target.id] = " ".join(str(following.value.value).split())
-    return documentation
-
-
-def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
+def read_flags(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
     """Settings of a file as flags of the command line, which checks their values.
 
     Args:
         path: JSON that `rlftsim recipe NAME --json` printed, or the config.json of a run.
-        recipe: gives the names and types that settings may have.
-        sections: sections whose settings are used; others in the file are skipped.
-        run_section: section that the config.json of a run belongs to.
+        recipe: Recipe with the names and types that settings may have.
+        sections: Sections whose settings are used; others in the file are skipped.
+        run_section: Section that the config.json of a run belongs to.
 
     Raises:
-        ConfigError: the file cannot be read, or a setting is unknown (the nearest known name is in the message).
+        ConfigError: The file cannot be read, or a setting is unknown (the nearest known name is in the message).
     """
     # 1. sections by name
     values = _read_mapping(path)
@@ -113,15 +90,15 @@ def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_secti
             continue
         group, _, last = name.rpartition(".")
         owner = attrgetter(group)(recipe)
-        words += flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
+        words += to_flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
     return words
 
 
-def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
+def to_flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
     """A setting as words of the command line.
 
     Args:
-        name: dotted name, e.g. "finetune.kl.target".
+        name: Dotted name, e.g. "finetune.kl.target".
         value: Value in JSON: a number, a text, true, false, null or a list.
         is_switch: True = written `--name` or `--no-name`, without a value.
     """
