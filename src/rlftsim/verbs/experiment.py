@@ -18,7 +18,7 @@ from rlftsim.scenario.open import SYNTHETIC, dataset_folder
 from rlftsim.verbs.arguments import Device, Processes, RecipeOption
 from rlftsim.verbs.inputs import to_recipe
 
-QUESTIONS = "; ".join(f"{name}: {experiment_by_name(name).question}" for name in PAPER)
+QUESTIONS = "Experiment. " + "; ".join(f"{name}: {experiment_by_name(name).question}" for name in PAPER)
 QUESTIONS += "; exam: Are models better where no choice was made? (see `rlftsim experiment exam --help`)"
 
 

@@ -101,13 +101,13 @@ def finetune(
         recipe: Settings to start from; `rlftsim recipe` lists all recipes. The flags below change single fields. The
             model brings its own architecture, so any recipe fits any model. In Python also a recipe itself; left out,
             the paper's settings.
-        method: rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised fine-tuning along
-            rollouts that choose the token closest to the log among the top K, fields catk.*. road: supervised
-            fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the goal-conditioned
-            weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft with goals
-            (--model OUT), fields gcsl.*. calibrate: fit the weights of a few named features on the token logits, no
-            weight of the model, to a realism reward without a change of speed, fields calibrate.*. Another NAME: the
-            method that another package has registered, fields NAME.*.
+        method: Training method. rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised
+            fine-tuning along rollouts that choose the token closest to the log among the top K, fields catk.*. road:
+            supervised fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the
+            goal-conditioned weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft
+            with goals (--model OUT), fields gcsl.*. calibrate: fit the weights of a few named features on the token
+            logits, no weight of the model, to a realism reward without a change of speed, fields calibrate.*. Another
+            NAME: the method that another package has registered, fields NAME.*.
         goal: Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
             --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
             weights alone. Left out, the model keeps the goal conditioning it has.

@@ -6,6 +6,7 @@ from typing import Any
 from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import recipe_as_json, recipe_as_text
 from rlftsim.verbs.arguments import Name
+from rlftsim.verbs.inputs import to_recipe
 
 
 def recipe(name: Name = "") -> Any:
