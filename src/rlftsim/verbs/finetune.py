@@ -9,7 +9,6 @@ import tyro
 
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
-from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import to_scenarios
@@ -20,7 +19,7 @@ from rlftsim.training.goal_relabeling import NOT_VALIDATED, GcslConfig
 from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.method import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, Processes, Settings
-from rlftsim.verbs.inputs import check_config
+from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
 from rlftsim.verbs.training import find_held_out, load_start, print_model, train, with_processes, write_card
 
@@ -132,11 +131,11 @@ def finetune(
     training = to_scenarios(scenarios, split)
     settings: Any = config
     if settings is None:
-        given = recipe or Recipe(road=RoadConfig(), calibrate=CalibrateConfig())
+        base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
+        # a recipe that is handed over has what it should have
         if not isinstance(recipe, Recipe):
-            given = recipe_by_name(str(recipe)) if recipe else given
-            given = _complete_recipe(given, find_section(method), has_goals=goal is not None)
-        settings = _find_settings(given, type(given).__name__ if recipe is None else recipe, method)
+            base = _complete_recipe(base, find_section(method), has_goals=goal is not None)
+        settings = _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
     settings = with_processes(settings, processes)
     trainer = find_method(settings)
     every = settings.validation.every if trainer is not None and trainer.validates else 0

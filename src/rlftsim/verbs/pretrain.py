@@ -150,7 +150,8 @@ def pretrain(
             # a recipe that is handed over has the sizes of the model already, and other values where these are free
             like = recipe if isinstance(recipe, Recipe) else _to_recipe_like(recipe_by_name(recipe), learner)
             # without a vocabulary all that recipes of other packages may know
-            learner = like.train_further(learner, *(() if tokens is None else (tokens, keep_tokens)))
+            replaced = () if tokens is None else (tokens, keep_tokens)
+            learner = like.train_further(learner, *replaced)  # pyright: ignore[reportArgumentType]
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
     return train(learner, training, out, settings, held_out=validation, card=card, device=device)
 

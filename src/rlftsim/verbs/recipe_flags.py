@@ -83,10 +83,10 @@ def select_flags(label: str, command: Command, words: Sequence[str], name: str |
     foreign = [section for section in SECTIONS if section not in command.sections]
     used = " and ".join(f"--{section}.*" for section in command.sections)
     check_no_settings(list_flags(words), foreign, f"here: the settings of {label} are {used}.")
-    if name is None and command.recipe in command.positional:
-        name = guess_recipe_name(words)
-    elif name is None:
-        name = find_value("--recipe", words) or read_arguments(command.function)[command.recipe].default
+    if command.recipe in command.positional:
+        name = name or guess_recipe_name(words)
+    else:
+        name = str(name or find_value("--recipe", words) or read_arguments(command.function)[command.recipe].default)
     flags = RecipeFlags(name, recipe_by_name(name), command.sections, command.sections, command.sections[-1])
     adapt = getattr(importlib.import_module(command.module), "adapt_flags", None)
     return flags if adapt is None else adapt(flags, words)

@@ -70,7 +70,7 @@ def tokens(
     if (out is None) == (not check):
         raise ConfigError("tokens needs either --out FILE, to build a vocabulary, or --check FILE, to look at one.")
     check_config(config, "tokens", TokensConfig)
-    settings = config or to_recipe(recipe).tokens or TokensConfig()
+    settings = config if isinstance(config, TokensConfig) else to_recipe(recipe).tokens or TokensConfig()
     if out is not None and out.suffix not in ("", ".safetensors"):
         raise ConfigError(
             f"--out {out}: vocabularies are safetensors files: name it {out.with_suffix('.safetensors')}."
