@@ -4,6 +4,7 @@ import io
 import os
 import re
 import shlex
+import shutil
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
@@ -68,8 +69,9 @@ def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
     with stand_ins():
         summaries = [describe(COMMANDS[f"{verb} {action}"].function).partition("\n")[0] for action in actions]
     print(f"usage: rlftsim {verb} [-h] {{{','.join(actions)}}}\n\n{ACTIONS[verb]}\n")
+    columns = shutil.get_terminal_size().columns
     for action, summary in zip(actions, summaries):
-        print(textwrap.fill(summary, 100, initial_indent=f"  {action:9}", subsequent_indent=" " * 11))
+        print(textwrap.fill(summary, columns, initial_indent=f"  {action:9}", subsequent_indent=" " * 11))
     raise SystemExit(0)
 
 
@@ -78,7 +80,7 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
     command, flags, complete = COMMANDS[name], None, words
     if command.sections:
         # Imported late: most verbs do not need recipes.
-        from rlftsim.verbs.recipe_flags import select_flags
+        from rlftsim.cli.recipes import finish_call, select_flags
 
         flags = select_flags(name, command, words, recipe)
         complete = flags.read_file(words)
@@ -108,7 +110,7 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
     if complaint.getvalue():
         log.warning(complaint.getvalue().rstrip())
     _check_values(call.values, [*name.split(), *words])
-    return call if flags is None else flags.finish(call, list_flags(words))
+    return finish_call(call, flags, list_flags(words)) if flags else call
 
 
 def _help_text(read: Any) -> str:
