@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import is_dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -42,9 +43,7 @@ def parse(words: Sequence[str]) -> Call:
         SystemExit: They ask for help, which has been printed.
     """
     # switches that may be left out get the value that tyro expects
-    words = [
-        part for word in words for part in (["--goal-logit-bias", EITHER_OR[word]] if word in EITHER_OR else [word])
-    ]
+    words = list(chain.from_iterable(["--goal-logit-bias", EITHER_OR[w]] if w in EITHER_OR else [w] for w in words))
     name = next((name for name in (" ".join(words[:2]), words[0]) if name in COMMANDS), None)
     if name is None:
         _explain_actions(words[0], words[1:])

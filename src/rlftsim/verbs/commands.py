@@ -113,8 +113,11 @@ class Argument:
         """Settings whose fields become flags, with their defaults; None for any other argument."""
         if is_dataclass(self.default):
             return self.default
-        kinds = get_args(self.annotation) or (self.annotation,)
-        return next((kind() for kind in kinds if isinstance(kind, type) and is_dataclass(kind)), None)
+        choices = get_args(self.annotation) or (self.annotation,)
+        return next(
+            (cls() for cls in choices if isinstance(cls, type) and is_dataclass(cls)),
+            None,
+        )
 
     def to_parameter(self, *markers: Any) -> inspect.Parameter:
         """The argument as tyro reads it, its text on one line; settings become the flags of their fields.
@@ -163,13 +166,13 @@ def settings_parser(settings: Any) -> Callable[..., Any]:
     Args:
         settings: Dataclass; fields that are dataclasses become groups of flags.
     """
-    kind = type(settings)
-    hints, texts = get_type_hints(kind, include_extras=True), read_field_texts(kind)
+    cls = type(settings)
+    hints, texts = get_type_hints(cls, include_extras=True), read_field_texts(cls)
     arguments = [
         Argument(field.name, hints[field.name], getattr(settings, field.name), texts.get(field.name, ""))
         for field in fields(settings)
     ]
-    return with_parameters(kind, summarize_docstring(kind), [argument.to_parameter() for argument in arguments])
+    return with_parameters(cls, summarize_docstring(cls), [argument.to_parameter() for argument in arguments])
 
 
 def with_parameters(
@@ -199,8 +202,8 @@ def list_flags(words: Sequence[str]) -> list[str]:
 
 def without_none(annotation: Any) -> Any:
     """A type without None, which nobody gives where a value is required."""
-    kinds = [kind for kind in get_args(annotation) if kind is not types.NoneType]
-    return Union[tuple(kinds)] if get_origin(annotation) in (Union, types.UnionType) else annotation  # noqa: UP007
+    choices = [cls for cls in get_args(annotation) if cls is not types.NoneType]
+    return Union[tuple(choices)] if get_origin(annotation) in (Union, types.UnionType) else annotation  # noqa: UP007
 
 
 def to_flag_type(annotation: Any) -> Any:

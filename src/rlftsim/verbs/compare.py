@@ -25,7 +25,7 @@ def compare(a: Result, b: Result, *, alpha: float = 0.05) -> Comparison | DriveC
     Differences are b minus a.
 
     Args:
-        a: The reference, such as the base model: a result of `evaluate`, or a parquet file that `rlftsim evaluate` or
+        a: Reference, such as the base model: a result of `evaluate`, or a parquet file that `rlftsim evaluate` or
             `rlftsim drive` wrote.
         b: Another one on the same scenarios, such as that of the fine-tuned model.
         alpha: Significance level: probability of calling a difference that is none.
@@ -54,8 +54,8 @@ def print_comparison(comparison: Comparison | DriveComparison, *, a: Result, b: 
 
     Args:
         comparison: Differences of the two results.
-        a: The reference, see `compare`.
-        b: The other result.
+        a: Reference, see `compare`.
+        b: Other result.
     """
     if isinstance(comparison, DriveComparison):
         print_wide(format_drives(comparison.a, comparison.b), format_drive_comparison(comparison))

@@ -88,14 +88,14 @@ def experiment(
         data: Folder of a data set with the splits training and validation.
         base_model: Model to fine-tune: a run, a model folder or a registered name. Left out, one is pre-trained by the
             recipe.
-        counterpart_model: The same for the other architecture of model-agnosticism.
+        counterpart_model: Model to fine-tune of the other architecture of model-agnosticism; likewise.
         seeds: Fine-tuning runs of each kind, with different seeds. Left out: as many as the experiment's table needs, 3
             for benchmark and credit, else 1.
         num_rollouts: Rollouts of each scenario in evaluations.
         rollouts_per_pass: Rollouts simulated together in evaluations. Changes no result; small models are faster with
             all in one pass.
         metric: Year of the meta-metric in evaluations.
-        limit: Evaluate on the first LIMIT held-out scenarios only.
+        limit: Number of held-out scenarios to evaluate on, the first ones.
         jobs: Processes that evaluate, each with one thread. Left out: one for each core, or a single one on a GPU.
         processes: Processes that train, in short for device.processes of each section.
         device: Device of evaluations; training has its own, such as --finetune.device.accelerator.

@@ -128,19 +128,19 @@ def to_recipe(recipe: Any) -> Recipe:
     return recipe if isinstance(recipe, Recipe) else recipe_by_name(validate_name(recipe, "recipe", "smart-demo"))
 
 
-def check_config(config: object, section: str, *kinds: type) -> None:
+def check_config(config: object, section: str, *classes: type) -> None:
     """Check that settings are of a kind that a verb takes, not a whole recipe.
 
     Args:
         config: Settings, or None.
         section: Section of a recipe, for the message.
-        kinds: Classes of settings.
+        classes: Classes of settings.
 
     Raises:
         ConfigError: Settings of no such kind.
     """
-    if not isinstance(config, (*kinds, type(None))):
-        *most, last = (kind.__name__ for kind in kinds)
+    if not isinstance(config, (*classes, type(None))):
+        *most, last = (settings_class.__name__ for settings_class in classes)
         names = f"{', '.join(most)} or {last}" if most else last
         raise ConfigError(
             f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."

@@ -56,7 +56,7 @@ def tokens(
     Args:
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
         out: File to write, e.g. vocabulary.safetensors.
-        check: Instead of building: a vocabulary file, or npz tables of the public CAT-K code.
+        check: Vocabulary file, or npz tables of the public CAT-K code, to look at instead of building one.
         report: Folder for the report. Left out, it is placed next to the vocabulary.
         recipe: Recipe whose section tokens is used; `rlftsim recipe` lists all.
         split: Split of the data set.
