@@ -187,7 +187,7 @@ def finetune(job: Job) -> Repeat:
     return update
 
 
-def train_policy(job: Job) -> Repeat:
+def pretrain(job: Job) -> Repeat:
     """A pre-training update: tokens, forward, loss, backward, clipping, AdamW."""
     import torch
     from torch.nn.functional import cross_entropy

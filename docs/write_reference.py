@@ -21,8 +21,8 @@ from pathlib import Path
 import rlftsim
 from rlftsim import errors
 from rlftsim.cli.main import OVERVIEW, VERBS, main
-from rlftsim.docstrings import read_field_texts, summarize_docstring
 from rlftsim.plugins import is_ours
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import list_sections
 from rlftsim.training.run_folder import to_plain

@@ -13,7 +13,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 FLOORS = (
     ("errors",),
     ("jobs",),
-    ("docstrings", "geometry", "plugins", "statistics"),
+    ("geometry", "plugins", "statistics"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

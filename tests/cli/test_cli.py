@@ -12,6 +12,8 @@ import typing
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -98,6 +100,43 @@ def evaluation(tmp_path, capsys):
     assert status == 0, err
     assert "oracle.parquet" in out
     return tmp_path / "e" / "oracle.parquet"
+
+
+def test_a_file_that_is_no_evaluation_is_never_replaced(evaluation, tmp_path, capsys):
+    damaged, foreign = tmp_path / "d" / "damaged.parquet", tmp_path / "d" / "tracks.parquet"
+    foreign.parent.mkdir()
+    pq.write_table(pa.table({"track": [1, 2]}), foreign)
+    damaged.write_bytes(evaluation.read_bytes()[:-100])
+    for path, cause in ((foreign, "not an evaluation of this version"), (damaged, "cannot be read (.*)")):
+        before = path.read_bytes()
+        status, _, err = run(
+            capsys, "evaluate", "oracle", "--data", "synthetic", "--limit", "1", "--out", path.parent,
+            "--name", path.stem,
+        )  # fmt: skip
+        assert (status, len(err.splitlines())) == (2, 1)
+        assert re.search(rf"{path} is in the way \({cause}\): choose another --out, or remove the file", err)
+        assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "evaluate oracle --data synthetic --limit 1 --out OUT",
+        "simulate constant_velocity --data synthetic --limit 1 --out OUT",
+        "convert OUT destination",
+        "score OUT --data synthetic",
+        "finetune smart-demo --model demo-base --data synthetic --out OUT",
+        "submit build constant_velocity --data synthetic --i-comply --out OUT",
+        "join simulate constant_velocity --data synthetic --out OUT",
+    ],
+)
+def test_a_path_that_is_no_text_is_refused_in_one_line(words, tmp_path, capsys):
+    out = tmp_path / os.fsdecode(b"ev\xff")
+    status, _, err = run(capsys, *words.replace("OUT", str(out)).split())
+    assert status == 2
+    assert err.endswith("ev\\udcff' is no text in UTF-8: rename the file or folder.\n")
+    assert len(err.splitlines()) == 1
+    assert not out.exists()
 
 
 WRONG = {
@@ -516,7 +555,7 @@ def test_rollouts_that_are_damaged_are_simulated_again(tmp_path, capsys, damage)
     cut.write_bytes(damage(whole))
     status, _, err = run(capsys, *arguments, "--scenario", *names)
     assert status == 0
-    assert f"{cut} is simulated again: " in err
+    assert f"{cut} has to be made again: " in err
     with np.load(cut) as again, np.load(io.BytesIO(whole)) as before:
         assert again.files == before.files
         assert all(np.array_equal(again[name], before[name]) for name in again.files)

@@ -21,10 +21,10 @@ BELOW = Mover(x_m=43.4, y_m=0.3, heading_rad=math.pi / 2, speed_mps=0.0)
 AHEAD = Mover(x_m=60.0, y_m=0.2, speed_mps=9.3)
 
 
-def bridge(*movers, up=(0,), road=ROAD, **scenario):
-    """The ego's road 6 m above the one that crosses it, or `road` in its place, and the tracks `up` on it."""
+def bridge(*movers, up=(0,), road=ROAD, height_m=6.0, **scenario):
+    """The ego's road above the one that crosses it, or `road` in its place, and the tracks `up` on it."""
     drawn = build_scenario("bridge", movers, junction_map(), **scenario)
-    return raised(drawn, lambda x: np.full_like(x, 6.0), road, up)
+    return raised(drawn, lambda x: np.full_like(x, height_m), road, up)
 
 
 def ramp(*movers):
@@ -48,9 +48,10 @@ def pushed(scenario, speed=10.0, steps=80, **settings):
     return env
 
 
+@pytest.mark.parametrize("height_m", [6.0, 1.9])  # cars are 1.6 m high
 @pytest.mark.parametrize(("road", "up"), [(ROAD, (0,)), (CROSSING, (1,))])
-def test_a_parked_car_under_or_over_the_road_is_not_met(road, up):
-    result = driven("replay", bridge(EGO, BELOW, road=road, up=up))
+def test_a_parked_car_under_or_over_the_road_is_not_met(road, up, height_m):
+    result = driven("replay", bridge(EGO, BELOW, road=road, up=up, height_m=height_m))
     assert result.record.collisions == ()
     assert (result.planner.time_to_collision, result.planner.least_ttc_s) == (1.0, 3.0)
     assert result.planner.nuplan_style > 0.8

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from rollout_drawing import draw_arrays, write_npz
@@ -37,6 +38,12 @@ def test_rollouts_that_go_on_from_the_log_are_taken_without_a_word(warnings_of):
         assert warnings_of(logged_states(scenario, num_rollouts=4), scenario) == []
 
 
+def test_vehicles_that_back_up_are_taken_without_a_word(warnings_of):
+    back = [scenes.Mover(y_m=4.0 * row, speed_mps=-5.0) for row in range(3)]
+    scenario = scenes.build_scenario("back", back)
+    assert warnings_of(logged_states(scenario, num_rollouts=2), scenario) == []
+
+
 def test_steps_that_the_log_lacks_may_hold_anything(warnings_of):
     scenario = scenes.with_gaps()
     states, valid = logged_states(scenario, num_rollouts=1), scenario.tracks.valid[scenario.simulated_indices, 11:]
@@ -54,6 +61,12 @@ def test_another_frame_is_told_by_scenario_agent_and_distance(warnings_of):
     assert "this one 6000 m from there in rollout 0." in line
 
 
+@pytest.mark.filterwarnings("error")
+def test_positions_whose_squares_no_number_holds_are_far(warnings_of):
+    states = logged_states(SCENARIO, num_rollouts=1)
+    assert "agents do not begin where the log stops" in warnings_of(replace(states, x=states.x + 3e38))[0]
+
+
 @pytest.mark.parametrize(
     ("axis", "change", "text"),
     [
@@ -61,6 +74,13 @@ def test_another_frame_is_told_by_scenario_agent_and_distance(warnings_of):
         ("x", lambda v: v + 7 * torch.arange(80.0), "from its current position, beyond 480 m, in rollout 0"),
         ("z", lambda v: v + 30, "z is 30 m from that of the current step"),
         ("heading", lambda v: torch.rad2deg(v + 3), r"heading of \d{3} rad \(degrees\?\)"),
+        (
+            "heading",
+            lambda v: v + np.pi / 2,
+            "6 of 6 agents do not begin with the heading .* 90 degrees from it in r",
+        ),
+        ("heading", lambda v: v + np.pi, "6 of 6 agents do not begin with the heading .* 180 degrees from it in r"),
+        ("heading", lambda v: v + torch.arange(80.0).clip(max=8) / 5, "4 of 4 paths .* faster than 3 m/s go sideways"),
     ],
 )
 def test_what_no_road_user_does_is_told(warnings_of, axis, change, text):

@@ -59,6 +59,14 @@ def test_a_minority_of_tracks_may_be_noisy_and_states_that_are_not_valid_hold_an
     assert describe_contradictions(replace(tracks, position=lost, valid=valid)) == ""
 
 
+def test_heights_that_are_none_contradict_the_motion(tracks):
+    position = tracks.position.copy()
+    position[..., 2] = 2.0 * position[..., 0]
+    assert describe_contradictions(replace(tracks, position=position)).startswith("heights contradict the motion of ")
+    position[..., 2] = 0.3 * position[..., 0]  # a steep road
+    assert describe_contradictions(replace(tracks, position=position)) == ""
+
+
 def test_synthetic_scenarios_do_not_contradict_themselves():
     assert not any(describe_contradictions(scenario.tracks) for scenario in ScenarioDataset("synthetic", cache_size=0))
 

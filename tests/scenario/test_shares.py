@@ -112,6 +112,22 @@ def test_simulations_and_augmented_goals_are_the_same_by_processes_and_by_shares
 
 
 @pytest.mark.parametrize("verb", ["simulate", "augment"])
+def test_a_file_that_was_cut_off_is_made_again_and_not_joined(verb, augment, tmp_path, capsys):
+    words = [*{"simulate": SIMULATE, "augment": augment}[verb], "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    before = contents(tmp_path / "out")
+    cut = sorted(path for path in (tmp_path / "out").iterdir() if path.suffix in (".npz", ".parquet"))[1]
+    cut.write_bytes(cut.read_bytes()[:-1000])
+    capsys.readouterr()
+    assert main(["join", *words]) == 1
+    err = capsys.readouterr().err
+    assert err.count(f"{cut} has to be made again: cannot be read") == 1
+    assert f"{verb}: 1 of" in err
+    assert main(words) == 0
+    assert contents(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("verb", ["simulate", "augment"])
 def test_a_second_simulation_or_augmentation_in_the_same_folder_is_refused(verb, augment, tmp_path, capsys):
     words = [*{"simulate": SIMULATE, "augment": augment}[verb], "--out", str(tmp_path / "out")]
     with Lease(tmp_path / "out" / ".lock", Inline(), "works in"):
@@ -255,6 +271,26 @@ def test_a_lock_that_a_clock_or_disk_has_spoiled_is_refused_in_one_line(tmp_path
         (tmp_path / "lock").write_bytes(text)
         with pytest.raises(NotYetError, match=rf"works in {tmp_path}{whom}: wait for it"):
             Lease(tmp_path / "lock", Inline(), "works in")
+
+
+@pytest.mark.parametrize("runner", [Inline(), Share(1, 2, Inline())])
+@pytest.mark.parametrize("text", [b"of the user\n", b"\xff\xfe", b"\nlocal notes since 2020-01-01T00:00:00\n"])
+def test_a_file_of_the_user_with_the_name_of_the_lock_stays(text, runner, tmp_path):
+    lock = tmp_path / ".lock"
+    lock.write_bytes(text)
+    with pytest.raises(DataError, match=r"\.lock is no lock of `rlftsim`: rename it, or choose another folder\.$"):
+        Lease(lock, runner, "works in")
+    folders.remove_locks(lock)
+    assert lock.read_bytes() == text
+
+
+@pytest.mark.parametrize("text", ["", "\n", "\nold process 12 since 2026-01-01T00:00:00+00:00\n0\n"])
+def test_a_lock_that_a_stopped_process_left_is_taken(text, tmp_path):
+    (tmp_path / ".lock").write_text(text)
+    with Lease(tmp_path / ".lock", Inline(), "works in") as lease:
+        assert f"process {os.getpid()}" in (tmp_path / ".lock").read_text()
+        lease.remove()
+    assert not (tmp_path / ".lock").exists()
 
 
 def test_a_share_that_ends_when_all_is_put_together_brings_nothing_back(tmp_path):

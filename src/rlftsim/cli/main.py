@@ -125,6 +125,11 @@ def parse(words: Sequence[str]) -> Any:
         ConfigError: The words make no sense.
         SystemExit: They ask for help, which has been printed.
     """
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:  # bytes that are no text, as Python keeps them; tables and messages take none
+            raise ConfigError(f"{in_short(word)} is no text in UTF-8: rename the file or folder.") from None
     # Imported late: the overview is printed without it.
     from rlftsim.cli.parse import parse as parse_words
 

@@ -1,4 +1,4 @@
-"""Settings as text: a recipe printed with its documentation, and files of settings read back as flags."""
+"""Settings as text: a recipe printed with documentation, and files of settings read back as flags."""
 
 import difflib
 import json
@@ -9,20 +9,20 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from rlftsim.docstrings import read_field_texts, summarize_docstring
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.documents import read_json
 from rlftsim.recipes.base import SECTIONS, Recipe, section_names
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
 
 def recipe_as_json(recipe: Recipe) -> str:
-    """A recipe as JSON, a mapping for each section. `--config FILE` reads it back."""
+    """A recipe as JSON, a mapping for each section; `--config FILE` reads the file."""
     return json.dumps({name: to_plain(section) for name, section in list_sections(recipe).items()}, indent=1)
 
 
 def recipe_as_text(recipe: Recipe) -> str:
-    """A recipe with the documentation of every field as a comment above it, in the notation of YAML."""
+    """A recipe with the documentation of every field as a comment above, in the notation of YAML."""
     return "\n\n".join(
         "\n".join([f"# {summarize_docstring(type(section))}", f"{name}:", *_write_lines(section, "  ")])
         for name, section in list_sections(recipe).items()
@@ -30,7 +30,7 @@ def recipe_as_text(recipe: Recipe) -> str:
 
 
 def list_sections(recipe: Recipe) -> dict[str, Any]:
-    """Sections that a recipe has, by name, in the order of their use."""
+    """Sections that a recipe has, by name, in the order of use."""
     return {name: getattr(recipe, name) for name in section_names(recipe)}
 
 
@@ -49,16 +49,16 @@ def _write_lines(section: Any, indent: str) -> Iterator[str]:
 
 
 def read_flags(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
-    """Settings of a file as flags of the command line, which checks their values.
+    """Settings of a file as flags of the command line, which checks the values.
 
     Args:
         path: JSON that `rlftsim recipe NAME --json` printed, or the config.json of a run.
         recipe: Recipe with the names and types that settings may have.
-        sections: Sections whose settings are used; others in the file are skipped.
+        sections: Sections that are used; further sections in the file are skipped.
         run_section: Section that the config.json of a run belongs to.
 
     Raises:
-        ConfigError: The file cannot be read, or a setting is unknown (the nearest known name is in the message).
+        ConfigError: A file that cannot be read, or an unknown setting; the message has the nearest known name.
     """
     # 1. sections by name
     values = _read_mapping(path)
@@ -86,11 +86,10 @@ def read_flags(path: Path, recipe: Recipe, sections: Sequence[str], run_section:
     # 3. values become words; tyro checks their types
     words: list[str] = []
     for name, value in values_by_name.items():
-        if name.partition(".")[0] not in sections:
-            continue
-        group, _, last = name.rpartition(".")
-        owner = attrgetter(group)(recipe)
-        words += to_flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
+        if name.partition(".")[0] in sections:
+            group, _, last = name.rpartition(".")
+            owner = attrgetter(group)(recipe)
+            words += to_flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
     return words
 
 

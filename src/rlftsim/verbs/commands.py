@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
-from rlftsim.docstrings import read_field_texts, summarize_docstring
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 
 NO_DEFAULT = inspect.Parameter.empty
 FLAG = re.compile(r"--[A-Za-z][\w.-]*")

@@ -17,7 +17,7 @@ from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import NOT_VALIDATED, GcslConfig
 from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.method import METHODS, find_method, method_by_name
+from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value

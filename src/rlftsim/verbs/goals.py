@@ -15,7 +15,7 @@ from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_wide
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_splits, dataset_folder
+from rlftsim.scenario.open import check_membership, dataset_folder
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 from rlftsim.viewer.figure import check_picture_path
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
@@ -59,7 +59,7 @@ def propose_goals(
     scenarios = ScenarioDataset(dataset_folder(data))
     goals, alternatives, panels = [], [], []
     for scenario_id in dict.fromkeys(scenario):
-        check_splits(scenarios, scenario_id, data, "--scenario")
+        check_membership(scenarios, scenario_id, data, "--scenario")
         logged = scenarios.by_id(scenario_id)
         table = Table(title=f"scenario {scenario_id}", title_justify="left")
         for heading in ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]"):
@@ -137,7 +137,7 @@ def check_goals(file: Path, data: str) -> None:
     scenarios, goals = ScenarioDataset(dataset_folder(data)), read_goals(file)
     lines = []
     for entry in (*goals.goals, *goals.alternatives):
-        check_splits(scenarios, entry.scenario_id, data, entry)
+        check_membership(scenarios, entry.scenario_id, data, entry)
         lines += goal_warnings(entry, scenarios.by_id(entry.scenario_id))
     for line in lines:
         print(line)

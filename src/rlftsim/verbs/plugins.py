@@ -12,7 +12,7 @@ from rlftsim.jobs.progress import print_wide
 POINTS = {
     "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
     "rlftsim.recipes": "rlftsim.recipes.registry:RECIPES",
-    "rlftsim.methods": "rlftsim.training.method:METHODS",
+    "rlftsim.methods": "rlftsim.training.registry:METHODS",
     "rlftsim.rewards": "rlftsim.rewards:REWARDS",
     "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
     "rlftsim.features": "rlftsim.policies.calibrated.features:FEATURES",

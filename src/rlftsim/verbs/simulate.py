@@ -27,7 +27,7 @@ from rlftsim.rollout.types import RolloutProvenance, Rollouts
 from rlftsim.scenario.any_form import to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_splits, open_dataset
+from rlftsim.scenario.open import check_membership, open_dataset
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goal_outcomes import read_rollouts, report_outcomes
@@ -116,6 +116,7 @@ def simulate(
             numbers.
     """
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed)
+    limit = None if limit is None else whole_number("limit", limit, 1)
     sampling = to_sampling(sampling)
     if out is not None:
         return _simulate_files(
@@ -127,18 +128,21 @@ def simulate(
     for name, value in options.items():
         if value not in (None, (), False):
             raise ConfigError(f"{name} has no effect on rollouts in memory: leave it out, or name a folder as out.")
-    model = with_guidance(to_policy(policy, device), guidance_scale)
+    model = with_guidance(_to_evaluated(to_policy(policy, device)), guidance_scale)
     if isinstance(scenarios, str | PathLike):
         scenarios = to_scenarios(scenarios, split)
     return _simulate_in_memory(model, to_batch(scenarios, get_device(model)), num_rollouts, seed, sampling, goals)
+
+
+def _to_evaluated(model: Policy) -> Policy:
+    """A copy in evaluation mode of a model in training mode: with dropout a seed would not say what happens."""
+    return frozen_copy(model) if is_training(model) else model
 
 
 def _simulate_in_memory(
     model: Policy, batch: ScenarioBatch, num_rollouts: int, seed: int, sampling: Sampling, goals: Any
 ) -> Rollouts:
     """Rollouts of a batch, one scenario after another; arguments as in `simulate`."""
-    if is_training(model):  # with dropout a seed would not say what happens
-        model = frozen_copy(model)
     if not isinstance(goals, Goals | Mapping | None):
         raise ConfigError(
             f"goals must be {{object_id: (x, y)}}, {{scenario_id: {{object_id: (x, y)}}}} or Goals, got {goals!r}."
@@ -225,7 +229,7 @@ def _simulate_files(
     """Write rollouts that have no file yet, report goals, and draw; arguments as in `simulate`."""
     # 1. model, data and goals; anything that does not fit is refused before the folder is touched
     exporters = [exporter_by_name(name) for name in export]
-    policy = with_guidance(to_policy(model, device), guidance_scale)
+    policy = with_guidance(_to_evaluated(to_policy(model, device)), guidance_scale)
     check_jobs(jobs, get_device(policy), "jobs")
     if not isinstance(data, str | PathLike | ScenarioDataset) or not isinstance(goals, str | PathLike | None):
         raise ConfigError("rollouts in a folder need a data set, and goals in a file: give these, or no folder.")
@@ -242,7 +246,7 @@ def _simulate_files(
     ids = list(dict.fromkeys(scenario or file.scenario_ids or scenarios.scenario_ids))[:limit]
     for scenario_id in ids:
         entries = file.of_scenario(scenario_id)
-        check_splits(scenarios, scenario_id, name, "--scenario" if scenario else next(iter(entries), ""))
+        check_membership(scenarios, scenario_id, name, "--scenario" if scenario else next(iter(entries), ""))
         if entries:
             warn_of_doubts(entries, scenarios.by_id(scenario_id))
         elif file.goals:

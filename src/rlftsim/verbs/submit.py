@@ -14,8 +14,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.open import open_dataset
-from rlftsim.submission.build import Job, build_archive
-from rlftsim.submission.build import delete_parts as delete_all_parts
+from rlftsim.submission.build import Job, build_archive, delete_shards
 from rlftsim.submission.check import ArchiveCheck, check_archive
 from rlftsim.submission.closed_loop import check_closed_loop, statement
 from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
@@ -116,7 +115,7 @@ def build(
     fingerprint = fingerprint_policy(policy)
     plan = make_plan(dataset, fingerprint, metadata, settings, num_shards=num_shards, round_m=round)
     job = Job(policy, dataset, plan, metadata, settings, round, out)
-    archive = build_archive(job, runner=work.runner(jobs, work.on_error), delete_parts=delete_parts)
+    archive = build_archive(job, runner=work.runner(jobs, work.on_error), is_deleting=delete_parts)
     # 3. check the file that will be uploaded, and report
     result = check_archive(archive, dataset)
     evaluation = evaluation or EVALUATIONS / f"{evaluation_name(model)}.parquet"
@@ -133,7 +132,7 @@ def build(
     if result.findings.has_errors:
         print(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
     else:
-        delete_all_parts(job)
+        delete_shards(job)
     print(f"{archive}: {result.size} bytes, SHA-256 {result.sha256}\n{text}")
     return int(result.findings.has_errors)
 
@@ -171,7 +170,7 @@ def check(
         except DataError as error:
             raise DataError(f"--score is for the validation split: {error}") from None
     scores = ArchiveScores() if score else None
-    result = check_archive(archive, dataset, sample=sample, expected_sha256=reported_sha256(archive), see=scores)
+    result = check_archive(archive, dataset, sample=sample, expected_sha256=reported_sha256(archive), callback=scores)
     _print_findings(result)
     if json is not None:
         write_findings(result, json)

@@ -1,4 +1,4 @@
-"""Texts of docstrings, for help and for printed settings."""
+"""Docstrings of settings, which become help texts and comments of printed recipes. No torch is imported."""
 
 import ast
 import inspect
@@ -13,7 +13,7 @@ def summarize_docstring(documented: object) -> str:
 
 
 def read_field_texts(config: type) -> dict[str, str]:
-    """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
+    """Docstrings below the fields of a dataclass, inherited fields included, each on a single line."""
     documentation: dict[str, str] = {}
     for owner in reversed(config.__mro__):
         if not is_dataclass(owner):
