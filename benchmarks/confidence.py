@@ -20,7 +20,7 @@ from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import STILL_TOKEN
 from rlftsim.training.data import batch_with_futures, trained_agents
-from rlftsim.training.map_use import MapUse, measure_map_use
+from rlftsim.training.monitoring import MapUse, measure_map_use
 
 FAST_MPS, STEP_S, TOKEN_S = 10.0, 0.1, 0.5
 VEHICLE_CLASS, VEHICLE_TYPE = 0, 1

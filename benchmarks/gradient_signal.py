@@ -22,8 +22,9 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.training.finetune import prepare, update_policy
-from rlftsim.training.parallel import DeviceConfig, start_fabric
+from rlftsim.training.config import DeviceConfig
+from rlftsim.training.parallel import start_fabric
+from rlftsim.training.reward import prepare, update_policy
 
 
 def main() -> None:

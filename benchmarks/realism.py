@@ -171,9 +171,9 @@ def measure_update(
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.scenario.batch import collate
     from rlftsim.scenario.womd import read_scenarios
-    from rlftsim.training.finetune import prepare, update_policy
-    from rlftsim.training.finetune_config import FinetuneConfig
-    from rlftsim.training.parallel import DeviceConfig, start_fabric
+    from rlftsim.training.config import DeviceConfig, FinetuneConfig
+    from rlftsim.training.parallel import start_fabric
+    from rlftsim.training.reward import prepare, update_policy
 
     torch.set_num_threads(1)
     scenarios = [s for s in read_scenarios(shared / "data" / "womd") if s.scenario_id.startswith(prefixes)]

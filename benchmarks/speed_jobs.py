@@ -167,8 +167,9 @@ def finetune(job: Job) -> Repeat:
     from rlftsim.recipes.smart import smart_demo_rlftsim
     from rlftsim.scenario.dataset import ScenarioDataset
     from rlftsim.scenario.synthetic import pack_path
-    from rlftsim.training.finetune import prepare, update_policy
-    from rlftsim.training.parallel import DeviceConfig, start_fabric
+    from rlftsim.training.config import DeviceConfig
+    from rlftsim.training.parallel import start_fabric
+    from rlftsim.training.reward import prepare, update_policy
 
     config = smart_demo_rlftsim().finetune
     # the recipe's own objective is not that of all versions
@@ -192,7 +193,7 @@ def pretrain(job: Job) -> Repeat:
     import torch
     from torch.nn.functional import cross_entropy
 
-    from rlftsim.training.imitation import PretrainConfig
+    from rlftsim.training.config import PretrainConfig
 
     policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), PretrainConfig()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -214,9 +215,10 @@ def catk(job: Job) -> Repeat:
     import torch
     from torch.nn.functional import cross_entropy
 
-    from rlftsim.training.catk import CatkConfig, roll_out_closest  # where older versions have it, too
-    from rlftsim.training.closed_loop import predict_targets
+    from rlftsim.training.catk_rollouts import roll_out_closest  # where older versions have it, too
+    from rlftsim.training.config import CatkConfig
     from rlftsim.training.freezing import freeze_untrained
+    from rlftsim.training.imitation import predict_targets
 
     policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), CatkConfig()
     freeze_untrained(policy, "decoder")
@@ -246,8 +248,8 @@ def near_scenarios(job: Job) -> list[Any]:
 
 def trained(batch: Any) -> Any:
     """Agents that count in an update."""
+    from rlftsim.training.config import PretrainConfig
     from rlftsim.training.data import trained_agents
-    from rlftsim.training.imitation import PretrainConfig
 
     config = PretrainConfig()
     return trained_agents(batch, 0, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed)

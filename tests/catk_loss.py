@@ -1,7 +1,6 @@
 """The loss of a CAT-K update, by itself."""
 
-from rlftsim.training.closed_loop import predict_targets
-from rlftsim.training.imitation import summed_loss
+from rlftsim.training.imitation import predict_targets, summed_loss
 
 
 def catk_loss(policy, batch, targeted, trained):

@@ -7,10 +7,7 @@ from rlftsim.experiments.rows import Row
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.tokens.clustering import TokensConfig
-from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.parallel import DeviceConfig
+from rlftsim.training.config import CatkConfig, DeviceConfig, FinetuneConfig, PretrainConfig
 
 CPU = DeviceConfig(accelerator="cpu", threads=1)
 TINY = SmartRecipe(

@@ -567,7 +567,7 @@ FORMATS: Mapping[str, Format] = {
         {"run/checkpoints/*4/*.safetensors": "safetensors", "run/checkpoints/*4/*.json": "json"},
         make_run,
         read_run,
-        ("training.checkpoint",),
+        ("training.run_folder",),
     ),
     "settings": Format({"*.json": "json"}, make_config, read_config, ("recipes.settings",)),
     "ledger": Format(

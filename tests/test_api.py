@@ -30,10 +30,7 @@ from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import build_vocabulary
-from rlftsim.training.catk import CatkConfig
-from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.parallel import DeviceConfig
+from rlftsim.training.config import CatkConfig, DeviceConfig, GcslConfig, PretrainConfig
 
 NAMES = [
     *("Scenario", "load_dataset", "write_dataset"),

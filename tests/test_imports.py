@@ -91,7 +91,7 @@ def test_imports_point_down(path):
     [
         ("import rlftsim.cli.main", {"cli"}),
         ("from rlftsim import cli, __version__", {"cli"}),
-        ("from rlftsim.training.finetune import finetune", {"training"}),
+        ("from rlftsim.training.reward import finetune", {"training"}),
         ("def f():\n    from rlftsim.viewer import page", {"viewer"}),
         ("if TYPE_CHECKING:\n    import rlftsim.realism as r", {"realism"}),
         ("from ..policies import layers", {"policies"}),

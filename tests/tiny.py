@@ -15,14 +15,18 @@ from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
-from rlftsim.training.alarms import AlarmConfig
-from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.parallel import DeviceConfig, is_first_process
-from rlftsim.training.reference import KlConfig
+from rlftsim.training.config import (
+    AlarmConfig,
+    CatkConfig,
+    DeviceConfig,
+    FinetuneConfig,
+    KlConfig,
+    PretrainConfig,
+    RoadConfig,
+    ValidationConfig,
+)
+from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
-from rlftsim.training.validation import ValidationConfig
 
 NUM_SCENARIOS = 5
 CPU = DeviceConfig(accelerator="cpu", threads=1)

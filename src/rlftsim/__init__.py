@@ -62,7 +62,7 @@ _MODULES = {
     "rlftsim.scenario.dataset": ("write_dataset",),
     "rlftsim.scenario.types": ("Scenario",),
     "rlftsim.studio.notebook": ("open_studio",),
-    "rlftsim.training.finetune_config": ("FinetuneConfig",),
+    "rlftsim.training.config": ("FinetuneConfig",),
     "rlftsim.verbs.check_policy": ("check_policy",),
     "rlftsim.verbs.compare": ("compare",),
     "rlftsim.verbs.evaluate": ("evaluate",),

@@ -14,7 +14,7 @@ from rlftsim.rollout.types import Rollouts as Rollouts
 from rlftsim.scenario.dataset import write_dataset as write_dataset
 from rlftsim.scenario.types import Scenario as Scenario
 from rlftsim.studio.notebook import open_studio as open_studio
-from rlftsim.training.finetune_config import FinetuneConfig as FinetuneConfig
+from rlftsim.training.config import FinetuneConfig as FinetuneConfig
 from rlftsim.verbs.check_policy import check_policy as check_policy
 from rlftsim.verbs.compare import compare as compare
 from rlftsim.verbs.evaluate import evaluate as evaluate

@@ -44,8 +44,7 @@ def source() -> str:
     # The entry point registers a policy, a source and a recipe; the decorators on the page are for notebooks.
     text = re.sub(r"^@(SOURCES|RECIPES)\.register.*\n", "", text, flags=re.MULTILINE)
     return (
-        re.sub(r"^assert .*\n", "", text, flags=re.MULTILINE)
-        + "\nfrom rlftsim.training.finetune import FinetuneConfig\n"
+        re.sub(r"^assert .*\n", "", text, flags=re.MULTILINE) + "\nfrom rlftsim.training.reward import FinetuneConfig\n"
     )
 
 
@@ -133,7 +132,7 @@ def slow_start():
 @pytest.mark.parametrize("code", [COMPUTES_AT_IMPORT, COMPUTES_IN_RECIPE], ids=["when imported", "in its recipe"])
 def test_a_recipe_that_computes_with_torch_has_a_help_text(code, tmp_path):
     """In a process of its own, where help starts without torch."""
-    imports = "from dataclasses import replace\nfrom rlftsim.training.finetune import FinetuneConfig\n"
+    imports = "from dataclasses import replace\nfrom rlftsim.training.reward import FinetuneConfig\n"
     entry_points = {"rlftsim.recipes": {"slow-start": "computing_package:slow_start"}}
     site = install(tmp_path / "site", "computing_package", imports + code, entry_points)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *sys.path])}

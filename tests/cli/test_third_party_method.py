@@ -13,10 +13,10 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.catk import CatkConfig, CatkMethod
-from rlftsim.training.finetune import RewardMethod
-from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.catk import CatkMethod
+from rlftsim.training.config import CatkConfig, FinetuneConfig
 from rlftsim.training.registry import METHODS, find_method, method_by_name
+from rlftsim.training.reward import RewardMethod
 from rlftsim.training.run_folder import read_metrics
 from third_party import installed
 

@@ -33,7 +33,7 @@ from rlftsim.experiments.stage_progress import Stage, run_stages
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.recipes.base import Recipe
 from rlftsim.rewards.base import leave_one_out
-from rlftsim.rewards.mloo import compute_mloo
+from rlftsim.rewards.realism import compute_mloo
 from rlftsim.scenario.dataset import write_dataset
 
 RNG = np.random.default_rng(5)

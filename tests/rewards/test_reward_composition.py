@@ -19,8 +19,8 @@ from rlftsim.rewards import (
 )
 from rlftsim.rewards.base import agent_rewards_by_name
 from rlftsim.training import experience as module
+from rlftsim.training.config import FinetuneConfig
 from rlftsim.training.experience import compute_reward
-from rlftsim.training.finetune_config import FinetuneConfig
 
 EVERYTHING = "mloo + 0.5*rloo - 0.01*minade_rloo + 0.1*collision_offroad + 2*collision_offroad_ade"
 

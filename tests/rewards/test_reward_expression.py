@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rlftsim.cli.main import parse
 from rlftsim.errors import ConfigError
 from rlftsim.rewards import Term, parse_reward, write_reward
-from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.config import FinetuneConfig
 
 NAMES = ["mloo", "rloo", "minade_rloo", "collision_offroad"]
 

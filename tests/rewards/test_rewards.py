@@ -22,8 +22,8 @@ from rlftsim.rewards import (
     reward_by_name,
 )
 from rlftsim.rewards.base import agent_rewards_by_name
-from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.rewards.realism import compute_mloo
+from rlftsim.training.config import FinetuneConfig
 
 values = st.integers(2, 8).flatmap(
     lambda n: st.lists(st.lists(st.floats(0, 1, width=32), min_size=n, max_size=n), min_size=1, max_size=3)

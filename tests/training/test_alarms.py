@@ -12,8 +12,9 @@ from rlftsim.errors import ConfigError
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
-from rlftsim.training.alarms import DRIFT_MONITORS, AlarmConfig, Alarms
+from rlftsim.training.config import AlarmConfig
 from rlftsim.training.experience import compute_diversity, compute_speed_gap
+from rlftsim.training.monitoring import DRIFT_MONITORS, Alarms
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 

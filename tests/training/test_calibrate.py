@@ -11,10 +11,18 @@ from safetensors.torch import load_file
 import tiny
 from rlftsim.errors import ConfigError
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.training.calibrate import FEATURES, CalibrateConfig, CalibrationLearner
-from rlftsim.training.constraints import CONSTRAINTS, Constraint, subtract_baseline
-from rlftsim.training.natural_step import best_length, natural_direction, t_value
+from rlftsim.training.calibrate import (
+    CONSTRAINTS,
+    CalibrationLearner,
+    Constraint,
+    best_length,
+    natural_direction,
+    split_scenarios,
+    t_value,
+)
+from rlftsim.training.config import FEATURES, CalibrateConfig
 from rlftsim.training.run import train_policy
 
 CONFIG = CalibrateConfig(
@@ -71,8 +79,8 @@ def test_the_credit_of_mloo_against_the_others_estimates_the_gain_of_the_whole_g
         group = list(outcome)
         values = VALUES[0, group]
         without = (values.sum() - values) / 2
-        mloo = (without.mean() - without)[None, :, None]  # as rewards.mloo
-        gradient += float(p[group].prod() * (subtract_baseline(mloo)[0, :, 0] * score[group]).sum())
+        mloo = (without.mean() - without)[None, :, None]  # as compute_mloo
+        gradient += float(p[group].prod() * (leave_one_out(mloo)[0, :, 0] * score[group]).sum())
     # without one of N the mean moves by 1 / (N - 1) in place of 1 / N
     assert gradient == pytest.approx(3 / 2 * (expected(1e-4) - expected(-1e-4)) / 2e-4, rel=1e-5)
 
@@ -211,11 +219,11 @@ def test_settings_that_make_no_sense_are_refused(changes, reason):
 
 
 def test_the_direction_and_its_length_come_from_different_scenarios():
-    fitted, held = CONFIG.split(10)
+    fitted, held = split_scenarios(CONFIG, 10)
     assert sorted(fitted + held) == list(range(10))
     assert len(held) == 2
     with pytest.raises(ConfigError, match="at least 2 scenarios"):
-        CONFIG.split(1)
+        split_scenarios(CONFIG, 1)
 
 
 def test_a_least_value_stays_without_any_rollout_but_the_least():

@@ -14,8 +14,8 @@ from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.catk import CatkConfig
 from rlftsim.training.catk_rollouts import roll_out_closest
+from rlftsim.training.config import CatkConfig
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 

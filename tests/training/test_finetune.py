@@ -18,13 +18,13 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training import experience
-from rlftsim.training import finetune as module
+from rlftsim.training import reward as module
+from rlftsim.training.config import FinetuneConfig, KlConfig
 from rlftsim.training.data import trained_agents
-from rlftsim.training.finetune import compute_reward, prepare, update_policy
-from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.experience import compute_reward
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import masked_sum
-from rlftsim.training.reference import KlConfig
+from rlftsim.training.reward import prepare, update_policy
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
@@ -546,7 +546,7 @@ def test_a_run_that_is_made_longer_and_stopped_stays_the_shorter_one(
         torch.manual_seed(0)
         config = replace(tiny.FINETUNE, epochs=epochs, checkpoint_every=1)
         with monkeypatch.context() as patch:
-            patch.setattr("rlftsim.training.finetune.update_policy", stop)
+            patch.setattr("rlftsim.training.reward.update_policy", stop)
             return train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
     def weights(model):
@@ -583,7 +583,7 @@ def test_a_run_that_was_stopped_may_be_made_longer_before_it_has_ended(
         return update_policy(learner, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr("rlftsim.training.finetune.update_policy", stop)
+        patch.setattr("rlftsim.training.reward.update_policy", stop)
         for epochs in (1.0, 4.0):
             with pytest.raises(KeyboardInterrupt):
                 train(epochs)

@@ -7,11 +7,9 @@ import tiny
 from rlftsim.goals.logged import logged_goals
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
-from rlftsim.training.finetune import prepare, update_policy
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goals import GoalConfig
+from rlftsim.training.config import FinetuneConfig, GoalConfig, KlConfig
 from rlftsim.training.parallel import start_fabric
-from rlftsim.training.reference import KlConfig
+from rlftsim.training.reward import prepare, update_policy
 
 CONFIG = FinetuneConfig(
     reward="gcft", goals=GoalConfig(probability=1.0, learning_rate_scale=20.0), batch_size=2, num_rollouts=32,

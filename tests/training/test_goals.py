@@ -24,19 +24,18 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.training import hindsight
-from rlftsim.training.augment import AugmentConfig, augment_goals
-from rlftsim.training.experience import Experience
-from rlftsim.training.finetune import compute_reward, prepare, update_policy
-from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.augment import augment_goals
+from rlftsim.training.config import AugmentConfig, FinetuneConfig, GcslConfig, GoalConfig, ValidationConfig
+from rlftsim.training.experience import Experience, compute_reward
 from rlftsim.training.freezing import freeze_untrained
-from rlftsim.training.goal_relabeling import GcslConfig, relabel_with_endpoints
-from rlftsim.training.goals import GoalConfig, choose_goals
+from rlftsim.training.goal_relabeling import relabel_with_endpoints
+from rlftsim.training.goals import choose_goals
 from rlftsim.training.hindsight import importance_ratio, met_goals, relabel_with_hindsight
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import agent_log_prob
+from rlftsim.training.reward import prepare, update_policy
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
-from rlftsim.training.validation import ValidationConfig
 
 CONFIG = replace(tiny.FINETUNE, num_rollouts=3, reward="gcft", goals=GoalConfig(probability=1.0))
 

@@ -51,8 +51,8 @@ def test_every_hyper_parameter_of_the_paper_is_in_the_table_and_the_default():
 
 def test_every_metric_of_a_run_is_explained(measured):
     from rlftsim.rewards import compute_rewards, parse_reward
-    from rlftsim.training.alarms import DRIFT_MONITORS
     from rlftsim.training.experience import Experience, describe_scenarios
+    from rlftsim.training.monitoring import DRIFT_MONITORS
 
     scores, rollouts, batch, _ = measured
     rewards = compute_rewards(parse_reward("mloo"), scores, rollouts, batch)

@@ -9,7 +9,7 @@ import torch
 import tiny
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.batch import collate
-from rlftsim.training.map_use import MapUse, measure_map_use, predicts_tokens
+from rlftsim.training.monitoring import MapUse, measure_map_use, predicts_tokens
 
 
 def policy_of(vocabulary, **changes):

@@ -16,7 +16,7 @@ from rlftsim.policies.distributions import TokenDistribution
 from rlftsim.realism import SimulatedStates, score
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rewards import leave_one_out
-from rlftsim.rewards.mloo import compute_mloo
+from rlftsim.rewards.realism import compute_mloo
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate

@@ -29,9 +29,8 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.training import finetune, processes
 from rlftsim.training.catk_rollouts import roll_out_closest
-from rlftsim.training.goals import GoalConfig
+from rlftsim.training.config import GoalConfig, ValidationConfig
 from rlftsim.training.run_folder import read_metrics
-from rlftsim.training.validation import ValidationConfig
 
 TIMES = ("seconds", "time")
 """Metrics of an update that are times."""

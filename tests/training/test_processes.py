@@ -20,12 +20,12 @@ from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training import parallel
+from rlftsim.training import reward as finetune_module
+from rlftsim.training.config import DeviceConfig, GoalConfig
 from rlftsim.training.data import share_cache
-from rlftsim.training.goals import GoalConfig
-from rlftsim.training.parallel import DeviceConfig, all_reduce_sum, num_sharing_memory
+from rlftsim.training.parallel import all_reduce_sum, count_processes, num_sharing_memory
 from rlftsim.training.processes import linked_processes
 from rlftsim.training.run_folder import read_metrics
 
@@ -216,7 +216,7 @@ def test_auto_is_a_process_for_each_core_with_limits(monkeypatch):
     monkeypatch.setattr(parallel, "usable_cores", lambda: 6)
 
     def processes(device=tiny.CPU, scenarios=100, batch_size=8, micro_batch_size=8, **more):
-        return device.num_processes(scenarios, batch_size, micro_batch_size, **more)
+        return count_processes(device, scenarios, batch_size, micro_batch_size, **more)
 
     assert processes() == 6
     assert processes(batch_size=2) == 2  # each needs a scenario of its own

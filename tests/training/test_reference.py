@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 from torch import nn
 
 from rlftsim.errors import ConfigError
-from rlftsim.training.reference import KlConfig, adapt_beta, sync_reference
+from rlftsim.training.config import KlConfig
+from rlftsim.training.reward import adapt_beta, sync_reference
 
 CONFIG = KlConfig()  # target 0.01, horizon 5
 

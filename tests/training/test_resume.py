@@ -17,9 +17,9 @@ from safetensors.torch import load_file
 import rlftsim
 import tiny
 from rlftsim.jobs.interruption import Interruption, signals_like_ctrl_c
-from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
-from rlftsim.training.batches import scenario_costs
+from rlftsim.training import reward as finetune_module
+from rlftsim.training.parallel import scenario_costs
 from rlftsim.training.run_folder import read_metrics
 
 MODULES = {

@@ -12,7 +12,7 @@ from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.runner import Inline
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.training import imitation
-from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.config import GcslConfig
 from rlftsim.training.method import check_trainable
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics

@@ -7,8 +7,7 @@ import tiny
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.rollout.edge_scenes import move_scenario
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.reference import KlConfig
+from rlftsim.training.config import FinetuneConfig, KlConfig
 from rlftsim.training.run_folder import RunFolder, board_tag, describe_inputs, read_metrics, to_plain
 
 

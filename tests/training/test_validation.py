@@ -15,9 +15,9 @@ from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.map_use import measure_map_use
+from rlftsim.training.config import ValidationConfig
+from rlftsim.training.monitoring import measure_map_use
 from rlftsim.training.run_folder import read_metrics
-from rlftsim.training.validation import ValidationConfig
 
 OFTEN = ValidationConfig(every=2, num_scenarios=3, num_rollouts=2, scenarios_per_pass=2)
 

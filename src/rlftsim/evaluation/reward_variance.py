@@ -24,7 +24,7 @@ from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
-from rlftsim.rewards.mloo import compute_mloo
+from rlftsim.rewards.realism import compute_mloo
 from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 

@@ -6,9 +6,7 @@ from typing import Literal
 
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
-from rlftsim.rewards import CreditTo
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goals import GoalConfig, with_goals
+from rlftsim.training.config import CreditTo, FinetuneConfig, GoalConfig, with_goals
 from rlftsim.training.method import TrainingSettings
 
 WEAK_EPOCHS = 1.0

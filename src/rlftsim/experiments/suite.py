@@ -39,6 +39,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
+from rlftsim.training.parallel import uses_cuda
 from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
 
 GOALS_SUFFIX: Mapping[GoalChoice, str] = {"none": "", "logged": "-logged-goals"}
@@ -75,7 +76,7 @@ class ExperimentSuite:
         recipe = self.recipe
         sections = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.road, recipe.gcsl)
         devices = [section.device for section in sections if section is not None]
-        if any(device.uses_cuda and device.processes not in ("auto", 1) for device in devices):
+        if any(uses_cuda(device) and device.processes not in ("auto", 1) for device in devices):
             raise ConfigError(
                 "experiments train on one GPU: leave device.processes at auto, or train by `rlftsim finetune` and "
                 "compare by `rlftsim evaluate`."

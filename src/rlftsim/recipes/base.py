@@ -21,13 +21,16 @@ from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.calibrate import CalibrateConfig
-from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.goals import with_goals
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.parallel import DeviceConfig
+from rlftsim.training.config import (
+    CalibrateConfig,
+    CatkConfig,
+    DeviceConfig,
+    FinetuneConfig,
+    GcslConfig,
+    PretrainConfig,
+    RoadConfig,
+    with_goals,
+)
 
 SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl", "calibrate")
 """Sections that the verbs of the command line know, in the order of their use; see `section_names`."""

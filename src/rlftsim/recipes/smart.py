@@ -15,13 +15,16 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.calibrate import CalibrateConfig
-from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.goals import GoalConfig
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.reference import KlConfig
+from rlftsim.training.config import (
+    CalibrateConfig,
+    CatkConfig,
+    FinetuneConfig,
+    GcslConfig,
+    GoalConfig,
+    KlConfig,
+    PretrainConfig,
+    RoadConfig,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

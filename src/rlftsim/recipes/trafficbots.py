@@ -12,11 +12,7 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.reference import KlConfig
+from rlftsim.training.config import CatkConfig, FinetuneConfig, GcslConfig, KlConfig, PretrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,9 +19,8 @@ from rlftsim.rollout.policy import ConditionablePolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.calibrate import CalibrateConfig
+from rlftsim.training.config import CalibrateConfig, PretrainConfig
 from rlftsim.training.goals import not_conditioned
-from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.method import TrainingSettings
 from rlftsim.training.registry import find_method
 from rlftsim.training.run import train_policy

@@ -1,14 +1,10 @@
-"""Rewards, a file for each: from rollouts and realism scores to a number per rollout.
+"""Rewards: from rollouts and realism scores to a number per rollout.
 
 `expression` reads sums of rewards as text, `composition` adds rewards up and assigns the credit.
 """
 
 # Importing a module registers its rewards.
-from rlftsim.rewards import collision_offroad as _collision_offroad
-from rlftsim.rewards import displacement as _displacement
-from rlftsim.rewards import goal as _goal
-from rlftsim.rewards import mloo as _mloo
-from rlftsim.rewards import rloo as _rloo
+from rlftsim.rewards import realism as _realism
 from rlftsim.rewards.base import (
     REWARDS,
     AgentRewards,
@@ -19,17 +15,18 @@ from rlftsim.rewards.base import (
     register_sum,
     reward_by_name,
 )
-from rlftsim.rewards.composition import CreditTo, Rewards, compute_rewards
+from rlftsim.rewards.composition import Rewards, compute_rewards
 from rlftsim.rewards.expression import Term, parse_reward, write_reward
+from rlftsim.rewards.goal import goal_terms
 
 __all__ = [
     "REWARDS",
     "AgentRewards",
-    "CreditTo",
     "Reward",
     "Rewards",
     "Term",
     "compute_rewards",
+    "goal_terms",
     "leave_one_out",
     "parse_reward",
     "register_agent_rewards",
@@ -39,4 +36,4 @@ __all__ = [
     "write_reward",
 ]
 
-del _collision_offroad, _displacement, _goal, _mloo, _rloo
+del _realism

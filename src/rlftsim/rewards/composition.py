@@ -16,7 +16,6 @@ credited to all in full. In a sum of rewards W is the weighted sum of the terms'
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,8 +27,6 @@ from rlftsim.rewards.base import agent_rewards_by_name, reward_by_name
 from rlftsim.rewards.expression import Term
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-
-CreditTo = Literal["rollout", "agent"]
 
 
 @dataclass(frozen=True, eq=False)

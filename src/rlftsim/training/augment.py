@@ -4,7 +4,6 @@ The logged endpoint is a single place an agent could go. For every scenario roll
 the most realistic rollout become further goals, which the policy is known to be able to reach.
 """
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,63 +11,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-from jaxtyping import Float, Int64
-from torch import Tensor
-
-from rlftsim.errors import ConfigError, check_positive, check_types, given
+from rlftsim.errors import ConfigError
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import read_goal_file, write_goal_file
-from rlftsim.goals.types import Points
 from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.runner import Inline, Runner
-from rlftsim.realism import RealismResult, metric_by_name, score_batch
-from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
-from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.types import Scenarios
+from rlftsim.training.config import AugmentConfig
 from rlftsim.training.data import batch_with_futures
+from rlftsim.training.experience import most_realistic_ends, score_rollouts
 from rlftsim.training.run_folder import RunFolder, describe_inputs
-
-
-def most_realistic(realism: RealismResult) -> Int64[Tensor, "B"]:
-    """Index of the rollout of each scenario with the highest single meta-metric."""
-    # A rollout without a finite score (nothing valid to compare with) is never chosen before one that has a score.
-    return torch.nan_to_num(realism.single_meta_metric, nan=-math.inf).argmax(-1)
-
-
-def select_ends(rollouts: Rollouts, index: Int64[Tensor, "B"]) -> Float[Tensor, "B A 2"]:
-    """Final positions of the agents in a selected rollout of each scenario, map frame.
-
-    Args:
-        rollouts: Rollouts of B scenarios, N of each.
-        index: Number of the selected rollout of each scenario, in [0, N).
-    """
-    return rollouts.position[torch.arange(len(index), device=index.device), index, :, -1]
-
-
-@dataclass(frozen=True)
-class AugmentConfig:
-    """Sampling of augmented goals."""
-
-    num_rollouts: int = 32
-    """Rollouts of a scenario among which the most realistic is taken (N_G); the paper does not give it."""
-    top_k: int | None = 32
-    """Most likely decisions that are sampled among; None = all, for policies whose decisions are not categories."""
-    metric: str = "2025"
-    """Configuration of the meta-metric."""
-    scenarios_per_part: int = 64
-    """Scenarios of a file; those of a finished file are not done again."""
-    seed: int = 0
-    """Of the rollouts."""
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        check_positive(self, ("num_rollouts", "scenarios_per_part", *given(self, ("top_k",))))
-        metric_by_name(self.metric)
 
 
 @dataclass(frozen=True)
@@ -138,16 +94,13 @@ def augment_goals(
     return len(scenarios)
 
 
-def _find_ends(policy: Policy, scenarios: Scenarios, config: AugmentConfig, index: int) -> tuple[str, Points]:
-    """Id of a scenario, and the object ids and endpoints (world frame) of the agents."""
+def _find_ends(policy: Policy, scenarios: Scenarios, config: AugmentConfig, index: int) -> tuple[str, Any]:
+    """Id of a scenario, and `Points` of the agents: object ids and endpoints, world frame."""
     batch = batch_with_futures(scenarios, [index]).to(get_device(policy))
     rollouts = simulate(
         policy, batch, num_rollouts=config.num_rollouts, seed=config.seed, goals=logged_goals(batch),
         sampling=Sampling(top_k=config.top_k),
     )  # fmt: skip
-    states = states_of_rollouts(batch, rollouts)
-    # A scenario without a map still has endpoints: it counts as on the road.
-    realism = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
-    ends = select_ends(rollouts, most_realistic(realism))  # [1, A, 2]
+    ends = most_realistic_ends(rollouts, score_rollouts(batch, rollouts, config.metric)[0])  # [1, A, 2]
     ends = batch.to_world(ends[:, None, :, None])[0, 0, :, 0]  # to_world takes [B, N, A, T, 2]
     return batch.scenarios[0].scenario_id, (batch.object_id[0].cpu().numpy(), ends.double().cpu().numpy())

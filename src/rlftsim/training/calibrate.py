@@ -13,144 +13,38 @@ the signal of all weights of a network is not after tens of thousands. K feature
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, check_positive, check_types
+from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
-from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
-from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rewards import compute_rewards, parse_reward, write_reward
+from rlftsim.realism import AgentScores, RealismResult
+from rlftsim.rewards import compute_rewards, leave_one_out, parse_reward
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
-from rlftsim.training.constraints import CONSTRAINTS, subtract_baseline
+from rlftsim.training.config import CalibrateConfig
 from rlftsim.training.data import batch_with_futures
+from rlftsim.training.experience import mean_speeds, score_rollouts
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
-from rlftsim.training.natural_step import best_length, natural_direction, t_value
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, num_sharing_memory
+from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 
 SUB_SCORES = ("kinematic", "interactive", "map_based")
 MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
 """Scores of the held-back scenarios, as `RealismResult` has them."""
-FEATURES = (
-    *("speed_gap_under_2s", "speed_gap_2_to_4s", "turn_to_lane_direction", "turn_to_lane_center"),
-    *("temperature_slow", "temperature_middle", "temperature_fast", "speed_slow", "speed_middle", "speed_fast"),
-    *("overlap_0.5s", "overlap_1s", "edge_0.5s", "edge_1s"),
-    *("overlap_0.5s_walking_cycling", "overlap_1s_walking_cycling", "edge_0.5s_walking_cycling"),
-)
-"""Features of this package, see `policies.calibrated.features`."""
+RIDGE = 1e-3
+"""Part of the Fisher matrix's diagonal that is added to it, so that features that go together share a weight."""
 
-
-@dataclass(frozen=True)
-class CalibrateConfig:
-    """Calibration of a model with a vocabulary: a few named features on the token logits."""
-
-    features: tuple[str, ...] = FEATURES
-    """Names of the features; `rlftsim.features` is their entry-point group."""
-    reward: str = "mloo"
-    """A registered reward, or a sum such as "mloo + 0.1*collision_offroad", credited to agents."""
-    metric: str = "2025"
-    """Configuration of the meta-metric the reward is made of."""
-    constraints: tuple[str, ...] = ("speed", "evaluated_speed")
-    """Means that the step leaves as they are, by prediction: speed, evaluated_speed, min_ade."""
-    kl: float = 0.01
-    """Predicted KL of a step of length 1, nats per decision."""
-    lengths: tuple[float, ...] = (0.7, 1.4)
-    """Lengths that are tried on the scenarios held back; the best one on a parabola through their gains is taken."""
-    max_kl: float = 0.03
-    """Largest measured KL of the result, nats per decision; a longer step is cut."""
-    held_back: float = 0.2
-    """Fraction of the scenarios that chooses the length, and not the direction."""
-    num_scenarios: int = 256
-    """Training scenarios that are used at most, drawn with the seed."""
-    num_rollouts: int = 8
-    """Rollouts N of each scenario and length."""
-    clip: float = 3.0
-    """Rewards of agents are clipped to so many standard deviations of all until then."""
-    batch_size: int = 4
-    """Scenarios between two lines of metrics, over all processes."""
-    micro_batch_size: int = 2
-    """Scenarios in memory at once, on each GPU or in all processes on a CPU together."""
-    checkpoint_every: int = 4
-    """Batches between two checkpoints, from which a run that was stopped goes on."""
-    seed: int = 0
-    """Seed of everything that is random in the run."""
-    device: DeviceConfig = field(default_factory=DeviceConfig)
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        check_positive(
-            self, ("kl", "max_kl", "clip", "num_scenarios", "batch_size", "micro_batch_size", "checkpoint_every")
-        )
-        if self.num_rollouts < 2:
-            raise ConfigError(f"credit needs at least 2 rollouts, got {self.num_rollouts}: raise num_rollouts.")
-        if not 0 < self.held_back < 1:
-            raise ConfigError(f"held_back is a fraction between 0 and 1, got {self.held_back}.")
-        if not self.lengths or min(self.lengths) <= 0:
-            raise ConfigError(f"lengths are numbers above 0, at least one, got {self.lengths}.")
-        unexpected = [name for name in self.constraints if name not in CONSTRAINTS]
-        if unexpected:
-            raise ConfigError(f"no constraint {unexpected[0]!r}: there are {', '.join(CONSTRAINTS)}.")
-        metric_by_name(self.metric)
-        object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
-
-    @property
-    def warmup_updates(self) -> int:
-        """0: there is no learning rate."""
-        return 0
-
-    @property
-    def max_skipped_in_a_row(self) -> int:
-        """1: no batch is skipped."""
-        return 1
-
-    def split(self, num_scenarios: int) -> tuple[list[int], list[int]]:
-        """Scenarios for the direction, and scenarios held back for the length.
-
-        Args:
-            num_scenarios: Number of scenarios in the data set, at least 2.
-
-        Raises:
-            ConfigError: Fewer than two scenarios.
-        """
-        if num_scenarios < 2:
-            raise ConfigError("calibration needs at least 2 scenarios: one for the direction and one for its length.")
-        key = derive_seed(self.seed, "calibrate") % 2**32
-        selected = np.random.default_rng(key).permutation(num_scenarios)[: self.num_scenarios].tolist()
-        num_held_back = min(max(round(self.held_back * len(selected)), 1), len(selected) - 1)
-        return selected[num_held_back:], selected[:num_held_back]
-
-    def tasks(self, num_scenarios: int) -> list[tuple[int | None, list[int]]]:
-        """Batches of the run in order, each a stage and positions in the list of the stage's scenarios.
-
-        Stage None finds the direction, stage 0 measures without a step, stage i tries length i.
-
-        Args:
-            num_scenarios: Number of scenarios in the data set, at least 2.
-        """
-        fitted_ids, held_back_ids = self.split(num_scenarios)
-        stages: list[tuple[int | None, int]] = [(None, len(fitted_ids))]
-        stages += [(index, len(held_back_ids)) for index in range(len(self.lengths) + 1)]
-        return [
-            (stage, list(range(first, min(first + self.batch_size, count))))
-            for stage, count in stages
-            for first in range(0, count, self.batch_size)
-        ]
-
-    def num_updates(self, num_scenarios: int) -> int:
-        """Batches of the run."""
-        return len(self.tasks(num_scenarios))
+Vector = Float64[np.ndarray, "K"]
 
 
 class CalibrateMethod(Method[CalibrateConfig]):
@@ -182,6 +76,19 @@ class CalibrateMethod(Method[CalibrateConfig]):
         return learner.measure(fabric)
 
 
+def split_scenarios(config: CalibrateConfig, num_scenarios: int) -> tuple[list[int], list[int]]:
+    """Indices of the scenarios for the direction, and of those held back for the length.
+
+    Args:
+        config: Settings of the run: numbers of scenarios, and the seed.
+        num_scenarios: Number of scenarios in the data set, at least 2.
+    """
+    num_fitted, num_held_back = config.split_sizes(num_scenarios)
+    random = np.random.default_rng(derive_seed(config.seed, "calibrate") % 2**32)
+    selected = random.permutation(num_scenarios)[: num_fitted + num_held_back].tolist()
+    return selected[num_held_back:], selected[:num_held_back]
+
+
 class Statistics(nn.Module):
     """Measurements of each scenario so far: all that a run resumes from.
 
@@ -198,7 +105,7 @@ class Statistics(nn.Module):
     counts: Tensor
     """[3]: decisions, agents with a credit, and the sum of their squared credits."""
     scores: Tensor
-    """[1 + lengths, scenario held back, score]: as in `SCORES` of the learner."""
+    """[1 + lengths, scenario held back, score]: as in `names` of the learner."""
 
     def __init__(self, num_fitted: int, num_held_back: int, config: CalibrateConfig):
         super().__init__()
@@ -217,11 +124,21 @@ class CalibrationLearner(Learner):
     scenarios: Scenarios
 
     def __post_init__(self) -> None:
-        self.fitted_ids, self.held_back_ids = self.config.split(len(self.scenarios))
-        self.tasks = self.config.tasks(len(self.scenarios))
+        self.fitted_ids, self.held_back_ids = split_scenarios(self.config, len(self.scenarios))
         self.statistics = Statistics(len(self.fitted_ids), len(self.held_back_ids), self.config)
         self.start = self.policy.eta.detach().clone()
         self.names = (*MEASURED, *CONSTRAINTS, "kl", "num_decisions")
+        # Batches in order, each a stage and positions in the list of the stage's scenarios. Stage None finds the
+        # direction, stage 0 measures without a step, stage i tries length i.
+        stages = {
+            None: len(self.fitted_ids),
+            **dict.fromkeys(range(1 + len(self.config.lengths)), len(self.held_back_ids)),
+        }
+        self.tasks = [
+            (stage, list(range(count))[first : first + self.config.batch_size])
+            for stage, count in stages.items()
+            for first in range(0, count, self.config.batch_size)
+        ]
 
     @property
     def parameters(self) -> list[nn.Parameter]:
@@ -246,10 +163,12 @@ class CalibrationLearner(Learner):
         batches = [process_positions[first : first + size] for first in range(0, len(process_positions), size)]
         if stage is None:
             values = self._find_gradients(positions, batches, fabric)
+            note = f"direction, RMM {values['rmm']:.3f}"
         else:
             values = self._try_length(stage, positions, batches, fabric)
+            note = f"length {values['length']:g}, RMM {values['rmm']:.3f}, KL {values['kl']:.4f}"
         self.finish_update(is_good=True)
-        return UpdateReport(values, self._note(stage, values))
+        return UpdateReport(values, note)
 
     def finish(self) -> None:
         """Choose the length and hand the weights to the policy."""
@@ -279,31 +198,19 @@ class CalibrationLearner(Learner):
         step = length * self.direction
         eta = self.start.double().cpu().numpy() + step
         gradients = self.statistics.gradients.numpy()
-        table = [
-            {
-                "feature": name,
-                "eta": float(eta[index]),
-                "t": t_value(gradients[:, 0, index]),
-                "rmm": float(step[index] * gradients[:, 0, index].mean()),
-                **{
-                    score: float(step[index] * gradients[:, 1 + position, index].mean())
-                    for position, score in enumerate(SUB_SCORES)
-                },
+        table = []
+        for index, name in enumerate(self.config.features):
+            parts = {
+                score: float(step[index] * gradients[:, position, index].mean())
+                for position, score in enumerate(("rmm", *SUB_SCORES))
             }
-            for index, name in enumerate(self.config.features)
-        ]
-        changes = [
-            {
-                "length": tried,
-                "kl": float(kl - kls[0]),
-                **{
-                    name: {"change": float(np.nanmean(scores[name][row] - scores[name][0])),
-                           "t": t_value(_finite(scores[name][row] - scores[name][0]))}
-                    for name in self.names[:-2]
-                },
-            }
-            for row, (tried, kl) in enumerate(zip(self.config.lengths, kls[1:]), 1)
-        ]  # fmt: skip
+            table.append({"feature": name, "eta": float(eta[index]), "t": t_value(gradients[:, 0, index]), **parts})
+        changes = []
+        for row, (tried, kl) in enumerate(zip(self.config.lengths, kls[1:]), 1):
+            changes.append({"length": tried, "kl": float(kl - kls[0])})
+            for name in self.names[:-2]:
+                change = scores[name][row] - scores[name][0]
+                changes[-1][name] = {"change": float(np.nanmean(change)), "t": t_value(change[np.isfinite(change)])}
         return eta, {
             "reward": self.config.reward,
             "constraints": list(self.config.constraints),
@@ -320,47 +227,45 @@ class CalibrationLearner(Learner):
     def _find_gradients(self, positions: list[int], batches: list[list[int]], fabric: Fabric) -> dict[str, float]:
         """Gradients and Fisher matrix of some scenarios, into the statistics."""
         statistics, device = self.statistics, fabric.device
-        measured = [(batch_positions, *self._measure_credits(batch_positions, fabric)) for batch_positions in batches]
-        counts = torch.zeros(3, dtype=torch.float64, device=device)
-        for _, batch, _, credits, decisions, _ in measured:
+        measured, counts = [], torch.zeros(3, dtype=torch.float64, device=device)
+        for batch_positions in batches:
+            batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, None, fabric)
+            credits = self._assign_credits(batch, rollouts, realism, agents)  # [credit, B, N, A]
             earned = credits[0][batch.evaluated_mask[:, None].expand_as(credits[0])]
-            counts += torch.stack(
-                [decisions.sum().double(), torch.tensor(float(len(earned))).to(device), earned.square().sum()]
-            )
+            num_earning = torch.tensor(float(len(earned))).to(device)
+            counts += torch.stack([rollouts.decision_mask.sum().double(), num_earning, earned.square().sum()])
+            measured.append((batch_positions, recorder.score.double(), credits, realism.meta_metric.double()))
         statistics.counts += all_reduce_sum(counts, fabric).cpu()
         limit = self.config.clip * math.sqrt(float(statistics.counts[2] / statistics.counts[1].clamp(min=1)))
         rows = torch.zeros(len(positions), *statistics.gradients.shape[1:], dtype=torch.float64, device=device)
         fisher = torch.zeros_like(statistics.fisher, device=device)
-        rmm = torch.zeros(2, dtype=torch.float64, device=device)
-        for batch_positions, _, score, credits, _, realism in measured:
-            credits = torch.cat([credits[:1].clamp(-limit, limit), credits[1:]])  # [credit, B, N, A]
+        rmm_sums = torch.zeros(2, dtype=torch.float64, device=device)
+        for batch_positions, score, credits, rmm in measured:
+            credits = torch.cat([credits[:1].clamp(-limit, limit), credits[1:]])
             gradients = torch.einsum("cbna,bnak->bck", credits, score)
             rows[[positions.index(position) for position in batch_positions]] = gradients
             flat = score.flatten(0, 2)
             fisher += flat.T @ flat
-            rmm += torch.stack([realism.meta_metric.double().nansum(), realism.meta_metric.isfinite().sum()])
+            rmm_sums += torch.stack([rmm.nansum(), rmm.isfinite().sum()])
         statistics.gradients[positions] = all_reduce_sum(rows, fabric).cpu()
         statistics.fisher += all_reduce_sum(fisher, fabric).cpu()
-        total, count = all_reduce_sum(rmm, fabric).tolist()
+        total, count = all_reduce_sum(rmm_sums, fabric).tolist()
         return {"rmm": total / max(count, 1.0), "credit_std": limit / self.config.clip}
 
-    def _measure_credits(
-        self, batch_positions: list[int], fabric: Fabric
-    ) -> tuple[ScenarioBatch, Tensor, Tensor, Tensor, RealismResult]:
-        """Batch, score function [B, N, A, K], credits [credit, B, N, A], decisions [B], realism."""
-        batch = self._load(batch_positions, self.fitted_ids, fabric)
-        rollouts, recorder = self._simulate(batch, "direction", fabric)
-        realism, agents = self._score(batch, rollouts)
+    def _assign_credits(
+        self, batch: ScenarioBatch, rollouts: Rollouts, realism: RealismResult, agents: AgentScores
+    ) -> Float64[Tensor, "C B N A"]:
+        """Credits of the agents for the reward, the three sub-scores and the constraints."""
         rewards = compute_rewards(parse_reward(self.config.reward), realism, rollouts, batch, agents, credit_mixing=0.0)
-        decides = rollouts.decision_mask.any(-1)  # [B, N, A]
         shares = [rewards.by_agent.double(), *(agents.sub_scores[name].double() for name in SUB_SCORES)]
-        # A leave-one-out reward is centered on all rollouts: on the others it is larger by N / (N - 1).
-        credits = [subtract_baseline(values) for values in shares]
+        # A leave-one-out reward is centered on all rollouts: on the others it is larger by N / (N - 1). Then the score
+        # function of a rollout times its credit is the gradient to first order, though the mean depends on the rollout.
+        credits = [leave_one_out(values) for values in shares]
         for name in self.config.constraints:
             constraint = CONSTRAINTS[name]
             credits.append(constraint.credit(constraint.shares(batch, rollouts, agents).double()))
-        stacked = torch.stack([torch.where(decides, values.nan_to_num(), 0.0) for values in credits])
-        return batch, recorder.score.double(), stacked, rollouts.decision_mask.flatten(1).sum(1), realism
+        decides = rollouts.decision_mask.any(-1)  # [B, N, A]
+        return torch.stack([torch.where(decides, values.nan_to_num(), 0.0) for values in credits])
 
     def _try_length(
         self, stage: int, positions: list[int], batches: list[list[int]], fabric: Fabric
@@ -371,14 +276,12 @@ class CalibrationLearner(Learner):
             self.policy.eta.copy_(self.start + torch.from_numpy(length * self.direction).to(self.start))
         rows = torch.zeros(len(positions), len(self.names), dtype=torch.float64, device=fabric.device)
         for batch_positions in batches:
-            batch = self._load(batch_positions, self.held_back_ids, fabric)
-            rollouts, recorder = self._simulate(batch, "length", fabric)
-            realism, agents = self._score(batch, rollouts)
+            batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, stage, fabric)
             values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
             values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in CONSTRAINTS.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
             rows[[positions.index(position) for position in batch_positions]] = torch.stack(
-                [values[n].double() for n in self.names], -1
+                [values[name].double() for name in self.names], -1
             )
         rows = all_reduce_sum(rows, fabric).cpu()
         self.statistics.scores[stage, positions] = rows
@@ -386,27 +289,19 @@ class CalibrationLearner(Learner):
         kl = means.pop("kl") / max(means.pop("num_decisions"), 1.0)
         return {"length": length, **means, "kl": kl}
 
-    def _load(self, positions: list[int], ids: list[int], fabric: Fabric) -> ScenarioBatch:
-        return batch_with_futures(self.scenarios, [ids[position] for position in positions]).to(fabric.device)
-
-    def _simulate(self, batch: ScenarioBatch, purpose: str, fabric: Fabric) -> tuple[Rollouts, "_Recorder"]:
-        recorder = _Recorder(needs_score=purpose == "direction")
+    def _roll_out(
+        self, positions: list[int], stage: int | None, fabric: Fabric
+    ) -> tuple[ScenarioBatch, Rollouts, "_Recorder", RealismResult, AgentScores]:
+        """Scenarios of a stage, their rollouts with what was recorded, and the scores of these."""
+        ids, purpose = (self.fitted_ids, "direction") if stage is None else (self.held_back_ids, "length")
+        batch = batch_with_futures(self.scenarios, [ids[position] for position in positions]).to(fabric.device)
+        recorder = _Recorder(needs_score=stage is None)
         with fabric.autocast():
             rollouts = simulate(
                 self.policy, batch, num_rollouts=self.config.num_rollouts,
                 seed=derive_seed(self.config.seed, "calibrate", purpose), choose=recorder,
             )  # fmt: skip
-        return rollouts, recorder
-
-    def _score(self, batch: ScenarioBatch, rollouts: Rollouts) -> tuple[RealismResult, AgentScores]:
-        metric = metric_by_name(self.config.metric)
-        features = compute_batch_features(batch.scenarios, states_of_rollouts(batch, rollouts), missing_map="neutral")
-        return score_batch_features(features, metric), AgentScores(features, metric, batch.agent_mask.shape[1])
-
-    def _note(self, stage: int | None, values: Mapping[str, float]) -> str:
-        if stage is None:
-            return f"direction, RMM {values['rmm']:.3f}"
-        return f"length {values['length']:g}, RMM {values['rmm']:.3f}, KL {values['kl']:.4f}"
+        return batch, rollouts, recorder, *score_rollouts(batch, rollouts, self.config.metric)
 
 
 class _Recorder:
@@ -424,7 +319,7 @@ class _Recorder:
     def __init__(self, *, needs_score: bool):
         self.needs_score = needs_score
 
-    def __call__(self, distribution: Any, state: object, sampling: Sampling, noise: Tensor) -> Tensor:
+    def __call__(self, distribution: Any, state: object, sampling: Any, noise: Tensor) -> Tensor:
         decision = distribution.sample(sampling, noise)
         if self.needs_score:
             self.score = self.score + distribution.score_function(decision)
@@ -433,5 +328,113 @@ class _Recorder:
         return decision
 
 
-def _finite(values: Float64[np.ndarray, "S"]) -> Float64[np.ndarray, "n"]:
-    return values[np.isfinite(values)]
+# ---- constraints -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A sum over agents, of which the mean over rollouts is held, or the least."""
+
+    shares: Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
+    """Part of each agent in each rollout; they are summed over agents."""
+    is_minimum: bool = False
+    """True = the value is that of the rollout with the least sum."""
+
+    def value(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B"]:
+        """Value in each scenario."""
+        total = shares.sum(-1)
+        return total.amin(1) if self.is_minimum else total.mean(1)
+
+    def credit(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
+        """Contribution of an agent's decisions in a rollout to the value.
+
+        Summed with score functions over rollouts and agents, credits are an estimate of the value's gradient, without
+        bias where no agent's part depends on other agents.
+        """
+        if not self.is_minimum:
+            return leave_one_out(shares / shares.shape[1])
+        # Without the rollout of the least sum the value is the second one, without any other it is what it was.
+        first, second = shares.sum(-1).topk(2, dim=1, largest=False).indices.unbind(1)  # [B]
+        row, added = torch.arange(len(shares), device=shares.device), torch.zeros_like(shares)
+        added[row, first] = shares[row, first] - shares[row, second]
+        return added
+
+
+def share_speed(
+    batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores, *, is_evaluated: bool = False
+) -> Float[Tensor, "B N A"]:
+    """Parts of the agents in the mean speed, m/s, over the steps that the log has.
+
+    Args:
+        batch: Scenarios with logged tracks.
+        rollouts: N rollouts of each scenario.
+        agents: Scores of the same rollouts; not read here.
+        is_evaluated: True = only evaluated agents count.
+    """
+    speed, counts = mean_speeds(batch, rollouts)
+    if is_evaluated:
+        counts = counts & batch.evaluated_mask
+    return torch.where(counts[:, None], speed, 0.0) / counts.sum(-1).clamp(min=1)[:, None, None]
+
+
+CONSTRAINTS = {
+    "speed": Constraint(share_speed),
+    "evaluated_speed": Constraint(partial(share_speed, is_evaluated=True)),
+    "min_ade": Constraint(lambda batch, rollouts, agents: agents.displacement_error.double(), is_minimum=True),
+}
+"""Constrained means by name: m/s of all agents and of the evaluated ones, and minADE in m."""
+
+
+# ---- the step --------------------------------------------------------------------------------------------------------
+
+
+def natural_direction(
+    gradient: Vector, fisher: Float64[np.ndarray, "K K"], fixed: Float64[np.ndarray, "C K"], kl: float
+) -> Vector:
+    """Direction of the largest gain per KL, among directions with a predicted change of 0 in the fixed means.
+
+    Args:
+        gradient: Gradient [K] of the objective by the weights.
+        fisher: Covariance of the score function, per decision. A weight without covariance stays 0.
+        fixed: Gradients of means that are to stay unchanged.
+        kl: Predicted KL of the result, ½ e·F e, nats per decision.
+
+    Returns:
+        The step of that KL; zeros where the gradient has no part that is free to be followed.
+    """
+    is_used = np.diag(fisher) > 0
+    step = np.zeros_like(gradient)
+    metric = fisher[np.ix_(is_used, is_used)]
+    metric = metric + RIDGE * np.diag(np.diag(metric))
+    free = np.linalg.solve(metric, gradient[is_used]) if is_used.any() else step[is_used]
+    constrained = fixed[:, is_used]
+    if constrained.any():
+        # in the metric of the KL, so that the step changes as little as it has to
+        across = np.linalg.solve(metric, constrained.T)  # [K, C]
+        free = free - across @ np.linalg.lstsq(constrained @ across, constrained @ free, rcond=1e-10)[0]
+    square = free @ metric @ free
+    # what projection leaves of a gradient that lies along the constraints is rounding
+    if square > 1e-20 * max(gradient @ gradient, 1e-300):
+        step[is_used] = free * np.sqrt(2 * kl / square)
+    return step
+
+
+def best_length(lengths: Sequence[float], gains: Float64[np.ndarray, "S X"]) -> float:
+    """Length with the greatest gain on the parabola through 0 that fits measured gains best, up to the longest length.
+
+    Args:
+        lengths: Lengths that were tried, above 0.
+        gains: Measured gain of each length in each scenario.
+    """
+    tried, mean = np.asarray(lengths), gains.mean(0)
+    powers = np.stack([tried, tried**2], 1)[:, : len(tried)]  # a single length has a slope alone
+    slope, bend = (*np.linalg.lstsq(powers, mean, rcond=None)[0], 0.0)[:2]
+    if bend < 0:
+        return float(np.clip(-slope / (2 * bend), 0.0, tried.max()))
+    return float(tried.max()) if slope * tried.max() + bend * tried.max() ** 2 > 0 else 0.0
+
+
+def t_value(values: Float64[np.ndarray, "S"]) -> float:
+    """Mean of some scenarios over its standard error; 0 where all are equal, or for a single scenario."""
+    spread = values.std(ddof=1) if len(values) > 1 else 0.0
+    return float(values.mean() / (spread / np.sqrt(len(values)))) if spread > 0 else 0.0

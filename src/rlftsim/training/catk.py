@@ -15,69 +15,22 @@ Sources: Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic 
 """
 
 import copy
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, check_positive, given
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
-from rlftsim.training.catk_rollouts import DEFAULT_NUM_CANDIDATES, Choice, Targets, roll_out_closest
-from rlftsim.training.closed_loop import predict_targets
-from rlftsim.training.freezing import TrainedModules, freeze_untrained
-from rlftsim.training.goals import GoalConfig, check_goals, choose_goals
-from rlftsim.training.imitation import ImitationConfig, ImitationMethod, Imitator, Prediction
+from rlftsim.training.catk_rollouts import roll_out_closest
+from rlftsim.training.config import CatkConfig, GoalConfig, RoadConfig
+from rlftsim.training.freezing import freeze_untrained
+from rlftsim.training.goals import check_goals, choose_goals
+from rlftsim.training.imitation import ImitationMethod, Imitator, Prediction, predict_targets
 from rlftsim.training.method import check_trainable
 from rlftsim.training.parallel import Fabric
-
-
-@dataclass(frozen=True)
-class CatkConfig(ImitationConfig):
-    """Fine-tuning with CAT-K.
-
-    The defaults are published for SMART-tiny on WOMD, but for the epochs: the published file says 32, RLFTSim finds the
-    optimum between a quarter and one.
-    """
-
-    epochs: float = 1.0
-    learning_rate: float = 5e-5
-    final_lr_ratio: float = 0.05
-    label_smoothing: float = 0.0
-    num_candidates: int = DEFAULT_NUM_CANDIDATES
-    """K."""
-    choice: Choice = "closest"
-    """Choice of the rollouts: closest among the K most likely, top_k sampled from them, trajeglish sampled from the K
-    nearest, sampled the closest of K samples."""
-    targets: Targets = "nearest"
-    """Tokens to learn along the rollouts: the nearest to the log, or the ones taken."""
-    rollouts_of: Literal["update", "epoch"] = "update"
-    """Policy that rolls out: the present one, or as it was when the epoch began."""
-    max_distance_lengths: float | None = None
-    """A decision from farther off the log than so many lengths of its class's box does not count. None = all count."""
-    trained: TrainedModules = "decoder"
-    """The parts a policy names for fine-tuning, its last layers, its goal encoder, or everything."""
-    goal_probability: float = 0.0
-    """Probability of an agent to have its logged endpoint as a goal; for a goal-conditioned policy."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self, ("num_candidates", *given(self, ("max_distance_lengths",))))
-        if not 0 <= self.goal_probability <= 1:
-            raise ConfigError(f"goal_probability is a probability in [0, 1], got {self.goal_probability}.")
-
-
-@dataclass(frozen=True)
-class RoadConfig(CatkConfig):
-    """Fine-tuning with RoaD: CAT-K's settings with RoaD's rollouts and targets."""
-
-    num_candidates: int = 64
-    choice: Choice = "sampled"
-    targets: Targets = "taken"
-    rollouts_of: Literal["update", "epoch"] = "epoch"
 
 
 class CatkMethod(ImitationMethod[CatkConfig]):

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -26,24 +26,15 @@ from rlftsim.tokens.agent_tokens import (
     tokens_towards,
 )
 from rlftsim.tokens.vocabulary import Vocabulary, box_of_class, class_of_type
-from rlftsim.training.closed_loop import TargetedRollouts, TokenLogits
-
-DEFAULT_NUM_CANDIDATES = 32
-
-Choice = Literal["closest", "top_k", "trajeglish", "sampled"]
-"""closest: of the K most likely tokens the one that leads nearest to the log. top_k: sampled from the K most likely.
-trajeglish: sampled, by the model's probabilities, from the K that lead nearest. sampled: of K samples from the
-policy the one that leads nearest. Where the next logged state is not valid: the most likely token, samples from the K
-most likely ones, and with "sampled" a sample."""
-Targets = Literal["nearest", "taken"]
-"""nearest: the token of the whole vocabulary that leads nearest to the log. taken: the token of the rollout itself."""
+from rlftsim.training.config import Choice, Targets
+from rlftsim.training.imitation import TargetedRollouts, TokenLogits
 
 
 def roll_out_closest(
     policy: TokenPolicy,
     batch: ScenarioBatch,
     *,
-    num_candidates: int = DEFAULT_NUM_CANDIDATES,
+    num_candidates: int = 32,
     choice: Choice = "closest",
     targets: Targets = "nearest",
     max_distance_lengths: float | None = None,
@@ -113,7 +104,7 @@ def roll_out_closest(
         may_be_nan=True,
     )
     target, mask = (torch.stack(steps, -1) for steps in zip(*decision_targets))  # [B, N, A, L]
-    return TargetedRollouts(rollouts, target, mask, class_of_type(batch.object_type))
+    return TargetedRollouts(rollouts, target, mask, batch.object_type)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,13 @@
 """The experience of an update: rollouts of some scenarios, rewards, and the metrics that are logged."""
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.goals.attainment import is_passed, is_reached, rate
@@ -19,8 +20,8 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goals import GoalConfig, StoredGoals, choose_goals
+from rlftsim.training.config import FinetuneConfig, GoalConfig
+from rlftsim.training.goals import StoredGoals, choose_goals
 from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
 
 
@@ -109,22 +110,44 @@ def _gather_rollouts(rollouts: Rollouts, num_rollouts: int, fabric: Fabric) -> R
     return replace(rollouts, **joined, goals=goals)
 
 
-def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
-    """Realism and rewards of rollouts; a scenario without a map counts as on the road.
+def score_rollouts(batch: ScenarioBatch, rollouts: Rollouts, metric: str) -> tuple[RealismResult, AgentScores]:
+    """Realism of rollouts, and its split over agents; a scenario without a map counts as on the road.
 
-    The features behind both are measured once, however many terms the reward has.
+    The features behind both are measured once; shares of agents are computed on first use.
 
     Args:
-        batch: scenarios with futures.
+        batch: Scenarios with futures.
         rollouts: N rollouts of each scenario, in the frame of the batch.
-        config: reward, metric and credit assignment.
+        metric: Name of the meta-metric's configuration.
     """
-    metric = metric_by_name(config.metric)
+    config = metric_by_name(metric)
     features = compute_batch_features(batch.scenarios, states_of_rollouts(batch, rollouts), missing_map="neutral")
-    realism = score_batch_features(features, metric)
-    agents = AgentScores(features, metric, batch.agent_mask.shape[1]) if config.credit == "agent" else None
-    terms = parse_reward(config.reward)
-    return realism, compute_rewards(terms, realism, rollouts, batch, agents, credit_mixing=config.credit_mixing)
+    return score_batch_features(features, config), AgentScores(features, config, batch.agent_mask.shape[1])
+
+
+def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
+    """Realism and rewards of rollouts, see `score_rollouts`.
+
+    Args:
+        batch: Scenarios with futures.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
+        config: Reward, metric and credit assignment.
+    """
+    realism, agents = score_rollouts(batch, rollouts, config.metric)
+    terms, split = parse_reward(config.reward), agents if config.credit == "agent" else None
+    return realism, compute_rewards(terms, realism, rollouts, batch, split, credit_mixing=config.credit_mixing)
+
+
+def most_realistic_ends(rollouts: Rollouts, realism: RealismResult) -> Float[Tensor, "B A 2"]:
+    """Final positions of the agents in the rollout of each scenario with the highest single meta-metric, map frame.
+
+    Args:
+        rollouts: N rollouts of each scenario.
+        realism: Scores of the same rollouts, a row per scenario.
+    """
+    # A rollout without a finite score (nothing valid to compare with) is never chosen before one that has a score.
+    index = torch.nan_to_num(realism.single_meta_metric, nan=-math.inf).argmax(-1)
+    return rollouts.position[torch.arange(len(index), device=index.device), index, :, -1]
 
 
 def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[Experience], float]:
@@ -144,8 +167,7 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     deviations = []
     for experience in experiences:
-        speed, logged_valid = simulated_speeds(experience.batch, experience.rollouts)
-        mean_speed = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
+        mean_speed, _ = mean_speeds(experience.batch, experience.rollouts)
         deviation = torch.nan_to_num(mean_speed - mean_speed.mean(1, keepdim=True), 0.0, 0.0, 0.0)
         # A scenario of which no reward is known earns 0, and has no part in the regression.
         has_reward = ~experience.rewards.is_missing.all(0)  # [B]
@@ -290,6 +312,18 @@ def simulated_speeds(
     # The first simulated step starts at the current one, which is logged: [B, N, A, 1, 2].
     start = batch.position[:, None, :, CURRENT_STEP, None].expand(-1, rollouts.num_rollouts, -1, -1, -1)
     return torch.cat([start, rollouts.position], dim=-2).diff(dim=-2).norm(dim=-1) / STEP_S, logged_valid
+
+
+def mean_speeds(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[Float[Tensor, "B N A"], Bool[Tensor, "B A"]]:
+    """Mean speed of each agent over the steps that its log has, m/s, and True for agents with such steps; else 0.
+
+    Args:
+        batch: Scenarios with logged tracks.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
+    """
+    speed, logged_valid = simulated_speeds(batch, rollouts)
+    mean = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]
+    return mean, logged_valid.any(-1)
 
 
 class UpdateClock:

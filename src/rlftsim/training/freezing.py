@@ -1,7 +1,7 @@
 """The weights that a training method trains, and the learning rates."""
 
 import copy
-from typing import Any, Literal
+from typing import Any
 
 from torch import nn
 from torch.optim import Optimizer
@@ -11,9 +11,8 @@ from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import PolicyWithHead, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
+from rlftsim.training.config import TrainedModules
 from rlftsim.training.goals import not_conditioned
-
-TrainedModules = Literal["decoder", "head", "goals", "all"]
 
 
 def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[nn.Module, ...]:

@@ -9,14 +9,14 @@ Source: after Ghosh et al., "Learning to Reach Goals via Iterated Supervised Lea
 single round, with goal-free rollouts.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, check_positive
+from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import is_goal_conditioned
@@ -24,40 +24,12 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
-from rlftsim.tokens.vocabulary import class_of_type
-from rlftsim.training.closed_loop import TargetedRollouts, predict_targets
+from rlftsim.training.config import GcslConfig
 from rlftsim.training.freezing import freeze_untrained
 from rlftsim.training.goals import not_conditioned
-from rlftsim.training.imitation import ImitationConfig, ImitationMethod, Imitator, Prediction
+from rlftsim.training.imitation import ImitationMethod, Imitator, Prediction, TargetedRollouts, predict_targets
 from rlftsim.training.method import check_trainable
 from rlftsim.training.parallel import Fabric
-
-NOT_VALIDATED = "goal-free behavior does not change here. See what was learned by `rlftsim evaluate --goals logged`."
-
-
-@dataclass(frozen=True)
-class GcslConfig(ImitationConfig):
-    """Training of the goal encoder on relabelled rollouts."""
-
-    epochs: float = 1.0
-    batch_size: int = 8
-    micro_batch_size: int = 2
-    num_rollouts: int = 4
-    """Of each scenario in an update."""
-    learning_rate: float = 3e-3
-    final_lr_ratio: float = 0.05
-    gradient_clip: float = 1.0
-    label_smoothing: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self, ("num_rollouts",))
-        if self.validation.every:
-            raise ConfigError(f"gcsl.validation has no effect: {NOT_VALIDATED}")
-        if self.goal_learning_rate_scale != 1.0:
-            raise ConfigError(
-                "gcsl.goal_learning_rate_scale has no effect, nothing else is trained: set gcsl.learning_rate."
-            )
 
 
 class GcslMethod(ImitationMethod[GcslConfig]):
@@ -89,9 +61,8 @@ class GcslMethod(ImitationMethod[GcslConfig]):
         # Autocast keeps weights that it has cast, and those cast in the rollout have no gradient.
         torch.clear_autocast_cache()
         relabelled = relabel_with_endpoints(rollouts)
-        class_id = class_of_type(batch.object_type)
         # The targets are the decisions themselves, which were sampled without goals.
-        targeted = TargetedRollouts(relabelled, rollouts.decision, rollouts.decision_mask, class_id)
+        targeted = TargetedRollouts(relabelled, rollouts.decision, rollouts.decision_mask, batch.object_type)
         return predict_targets(model, context, targeted, trained)
 
 

@@ -24,8 +24,7 @@ from rlftsim.rewards import Term
 from rlftsim.rewards.goal import goal_advantage, goal_terms
 from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.types import Rollouts
-from rlftsim.training.augment import most_realistic, select_ends
-from rlftsim.training.experience import Experience
+from rlftsim.training.experience import Experience, most_realistic_ends
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 from rlftsim.training.policy_gradient import GradientSums, LossTerms, agent_log_prob, policy_gradient_loss
 
@@ -65,8 +64,8 @@ def met_goals(rollouts: Rollouts, realism: RealismResult) -> Goals:
     """
     assert rollouts.goals is not None
     # All rollouts of a scenario have the same goals: the mask of the first one serves.
-    ends = Goals.of_scenarios(select_ends(rollouts, most_realistic(realism)), rollouts.goals.goal_mask[:, 0])
-    return ends.repeat(rollouts.num_rollouts)
+    goals = Goals.of_scenarios(most_realistic_ends(rollouts, realism), rollouts.goals.goal_mask[:, 0])
+    return goals.repeat(rollouts.num_rollouts)
 
 
 def importance_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:

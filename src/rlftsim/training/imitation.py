@@ -10,27 +10,29 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.errors import ConfigError, check_finiteness, check_not_negative, check_positive, check_types, given
+from rlftsim.errors import ConfigError
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.rollout.policy import ImitationLoss, Prediction
+from rlftsim.rollout.policy import ImitationLoss, Prediction, TokenPolicy
+from rlftsim.rollout.rows import find_rows
+from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
-from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary
+from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary, class_of_type
+from rlftsim.training.config import ImitationConfig, PretrainConfig
 from rlftsim.training.data import trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum
-from rlftsim.training.validation import ValidationConfig
+from rlftsim.training.parallel import Fabric, all_reduce_gradients, all_reduce_sum
 
 IMPOSSIBLE = -1e8
 """A token that cannot be chosen has a smaller logit than this."""
@@ -38,91 +40,6 @@ IMPOSSIBLE = -1e8
 
 Predict = Callable[[ScenarioBatch, Bool[Tensor, "B A"]], Prediction | ImitationLoss]
 """Predictions of tokens, or a finished loss, both differentiable: for a batch and the agents that count."""
-
-
-@dataclass(frozen=True)
-class ImitationConfig:
-    """Learning by imitation. The defaults are those of the published SMART-tiny on WOMD."""
-
-    epochs: float = 32.0
-    """Passes over the training scenarios."""
-    batch_size: int = 80
-    """Scenarios per update, over all processes."""
-    micro_batch_size: int = 8
-    """Scenarios in memory at once, at most, on each GPU or in all processes on a CPU together; gradients add up over
-    the rest."""
-    micro_batch_cost: float | None = None
-    """Thousands of map points in memory at once, at most, an agent counted as 200: large scenarios come in
-    smaller groups. Processes on a CPU share it. None = no limit."""
-    learning_rate: float = 5e-4
-    """At its highest, after the warm-up."""
-    final_lr_ratio: float = 0.01
-    """The learning rate falls along a cosine to this fraction of it."""
-    warmup_updates: int = 0
-    """Updates over which the learning rate rises linearly."""
-    goal_learning_rate_scale: float = 1.0
-    """Learning rate of the goal encoder, if there is one, over that of all other weights."""
-    betas: tuple[float, float] = (0.9, 0.999)
-    """Decay rates of Adam's moments."""
-    weight_decay: float = 0.01
-    """Decoupled, as in AdamW."""
-    gradient_clip: float = 0.5
-    """Largest norm of the gradient."""
-    label_smoothing: float = 0.1
-    """Probability that the target gives to other tokens; the loss of a perfect model is then not zero. Without
-    effect on a policy that brings a loss of its own."""
-    label_smoothing_kind: Literal["uniform", "spatial"] = "uniform"
-    """Tokens that get it: all alike, or those that lead near the right one, see `tokens.smoothing`."""
-    context_radius_m: float | None = 150.0
-    """A step of an agent farther from the ego than this is taken as not logged. None = everything is seen."""
-    trained_radius_m: float = 100.0
-    """Agents farther from the ego at the current step are context only."""
-    max_trained_agents: int | None = 32
-    """Of a scenario; the evaluated ones always, the rest at random. None = all."""
-    mirror_probability: float = 0.0
-    """Probability of a scenario to be seen mirrored, left and right exchanged: twice the scenes, but half of them with
-    traffic on the other side of the road."""
-    still_weight: float = 1.0
-    """Weight of a prediction whose target stands still, in the loss and all metrics; others count 1. Three quarters of
-    all tokens stand and few turn, so a small weight teaches more per update. The learned probability of standing is
-    that of the data, whatever the weight. Needs a policy with a vocabulary."""
-    ema_decay: float | None = None
-    """Validate and save an exponential moving average of the weights, with this fraction of it kept at each update,
-    such as 0.999. Less is kept in the first updates. None = the weights themselves."""
-    max_skipped_in_a_row: int = 5
-    """An update whose gradient is not finite is skipped; after so many in a row the run stops."""
-    checkpoint_every: int = 200
-    """Updates."""
-    seed: int = 0
-    """Of everything that is random in the run."""
-    validation: ValidationConfig = field(default_factory=ValidationConfig)
-    device: DeviceConfig = field(default_factory=DeviceConfig)
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        sizes = ("batch_size", "micro_batch_size", "max_skipped_in_a_row", "checkpoint_every")
-        rates = ("learning_rate", "goal_learning_rate_scale", "gradient_clip", "trained_radius_m")
-        check_positive(self, ("epochs", *sizes, *rates, *given(self, ("micro_batch_cost", "context_radius_m"))))
-        check_not_negative(self, ("warmup_updates", "weight_decay", *given(self, ("max_trained_agents",))))
-        check_finiteness(self, ("epochs", "learning_rate", "weight_decay"))
-        if not all(0 <= beta < 1 for beta in self.betas):
-            raise ConfigError(f"betas are decay rates in [0, 1), got {self.betas}.")
-        if not 0 <= self.final_lr_ratio <= 1:
-            raise ConfigError(f"final_lr_ratio is a fraction in [0, 1], got {self.final_lr_ratio}.")
-        if not 0 <= self.mirror_probability <= 1:
-            raise ConfigError(f"mirror_probability is a probability in [0, 1], got {self.mirror_probability}.")
-        if not 0 < self.still_weight <= 1:
-            raise ConfigError(f"still_weight is a weight above 0 and at most 1, got {self.still_weight}.")
-        if self.ema_decay is not None and not 0 < self.ema_decay < 1:
-            raise ConfigError(f"ema_decay is a fraction between 0 and 1, or None, got {self.ema_decay}.")
-        if not 0 <= self.label_smoothing < 1:
-            raise ConfigError(f"label_smoothing is a probability in [0, 1), got {self.label_smoothing}.")
-        if self.label_smoothing_kind == "spatial" and not self.label_smoothing:
-            raise ConfigError("label_smoothing_kind=spatial has no effect: set label_smoothing above 0, such as 0.1.")
-
-    def num_updates(self, num_scenarios: int) -> int:
-        """Optimizer steps of the run."""
-        return max(math.ceil(self.epochs * num_scenarios / self.batch_size), 1)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -215,11 +132,6 @@ class ImitationMethod(Method[Config]):
         values["seconds"] = time.perf_counter() - start
         accuracy = f", accuracy {values['accuracy']:.0%}" if "accuracy" in values else ""
         return UpdateReport(values, f"loss {values['loss']:.3f}{accuracy}", "its gradient is not finite")
-
-
-@dataclass(frozen=True)
-class PretrainConfig(ImitationConfig):
-    """Pre-training. The defaults, which recipes change, are those of the published SMART-tiny on WOMD."""
 
 
 class PretrainMethod(ImitationMethod[PretrainConfig]):
@@ -406,3 +318,57 @@ def summed_loss(
     measured = {"accuracy": hits[:, 0], "top5_accuracy": hits.any(-1), "entropy": entropy}  # [r] each
     sums = {name: (weight * values).sum() for name, values in measured.items()}
     return ImitationLoss(loss, weight.sum(), sums)
+
+
+# ---- closed loop ---------------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class TokenLogits(Protocol):
+    """The part of a distribution over tokens that imitation needs."""
+
+    logits: Float[Tensor, "R V"]
+    """Of the R elements where the mask is True, in the mask's order."""
+    mask: Bool[Tensor, "B N A *L"]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetedRollouts:
+    """Rollouts with a target for each decision."""
+
+    rollouts: Rollouts
+    target: Int64[Tensor, "B N A L"]
+    """Token that should have been chosen."""
+    target_mask: Bool[Tensor, "B N A L"]
+    """True = there is a target."""
+    object_type: Int64[Tensor, "B A"]
+    """Type of each agent, which decides the class that its token ids refer to."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopPrediction:
+    """A policy's predictions along rollouts, as `imitation.Prediction`."""
+
+    logits: Float[Tensor, "R V"]
+    target: Int64[Tensor, "R"]
+    target_mask: Bool[Tensor, "R"]
+    class_id: Int64[Tensor, "R"]
+
+
+def predict_targets(
+    policy: TokenPolicy, context: Any, targeted: TargetedRollouts, trained: Bool[Tensor, "B A"]
+) -> ClosedLoopPrediction:
+    """Predictions along rollouts: differentiable, in a single parallel pass.
+
+    Args:
+        policy: the policy that rolled out.
+        context: the policy's encoding of the same scenarios.
+        targeted: the rollouts with targets.
+        trained: True = the agent's decisions count.
+    """
+    dist: TokenLogits = policy.score(context, targeted.rollouts)  # type: ignore[assignment]
+    counts = targeted.target_mask & targeted.rollouts.decision_mask & trained[:, None, :, None]  # [B, N, A, L]
+    class_id = class_of_type(targeted.object_type)[:, None, :, None].expand(counts.shape)
+    # The distribution has a row for each element of its mask only: pick the same ones, in the same order.
+    rows = find_rows(dist.mask, is_dense=len(dist.logits) == dist.mask.numel())
+    return ClosedLoopPrediction(dist.logits, *(values[rows] for values in (targeted.target, counts, class_id)))

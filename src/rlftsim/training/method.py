@@ -21,9 +21,16 @@ from torch.optim import Optimizer
 from rlftsim.errors import ConfigError
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
-from rlftsim.training.batches import check_scored, micro_batches, scenario_costs
+from rlftsim.training.config import DeviceConfig
 from rlftsim.training.data import batch_with_futures, mirrored_of_update, scenarios_of_update
-from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices, num_sharing_memory
+from rlftsim.training.parallel import (
+    Fabric,
+    check_scored,
+    local_indices,
+    micro_batches,
+    num_sharing_memory,
+    scenario_costs,
+)
 
 
 @runtime_checkable

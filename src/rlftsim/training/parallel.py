@@ -1,4 +1,4 @@
-"""Devices and processes.
+"""Devices and processes, and the scenarios of an update spread over them and cut into pieces that fit into memory.
 
 Every process works on a part of the global batch and adds up *sums*; the sums are added over the processes and divided
 by global counts. So the estimator equals that of a single process with the same global batch, no matter how scenarios
@@ -13,15 +13,19 @@ import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
+import numpy as np
 import torch
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, check_not_negative, check_positive, check_types
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.runner import usable_cores
-from rlftsim.training.batches import balance_by_cost
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.index_row import AGENT_COLUMNS, compute_index_row
+from rlftsim.scenario.types import TOTAL_STEPS, Scenarios
+from rlftsim.training.config import DeviceConfig
 
 MIN_SCENARIOS = 32
 """Data sets of fewer scenarios are trained on by one process, unless another number is given. (A limit of the data
@@ -68,60 +72,37 @@ class Fabric(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class DeviceConfig:
-    """Device, processes, precision and threads of a run."""
+def uses_cuda(config: DeviceConfig) -> bool:
+    """True if a run with these settings is on GPUs."""
+    return config.accelerator == "cuda" or (config.accelerator == "auto" and torch.cuda.is_available())
 
-    accelerator: Literal["auto", "cpu", "cuda"] = "auto"
-    """Kind of device; auto = CUDA if there is one."""
-    processes: int | Literal["auto"] = "auto"
-    """Processes on this machine, that is GPUs, or cores of a CPU. auto = one on a GPU, on a CPU one for each usable
-    core, but not more than scenarios in a batch or in memory at once, and one for a few scenarios. In fine-tuning more
-    than scenarios divide the rollouts of each. A run stores the number in its config.json and is resumed with it:
-    another one rounds otherwise. Under torchrun this and `num_nodes` have no effect: torchrun decides."""
-    num_nodes: int = 1
-    """Machines."""
-    precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    """float32, or bfloat16 where torch's autocast holds it safe."""
-    threads: int = 1
-    """CPU threads of each process; 0 = torch's own choice. More than one needs OMP_WAIT_POLICY=PASSIVE on shared cores.
-    Rollouts always use one."""
 
-    def __post_init__(self) -> None:
-        check_types(self)
-        check_positive(self, ("num_nodes", *(() if self.processes == "auto" else ("processes",))))
-        check_not_negative(self, ("threads",))
+def forks_processes(config: DeviceConfig) -> bool:
+    """True if `linked_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
+    return not uses_cuda(config) and config.num_nodes == 1 and not is_torchrun()
 
-    @property
-    def uses_cuda(self) -> bool:
-        """True if a run with these settings is on GPUs."""
-        return self.accelerator == "cuda" or (self.accelerator == "auto" and torch.cuda.is_available())
 
-    @property
-    def forks(self) -> bool:
-        """True if `linked_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
-        return not self.uses_cuda and self.num_nodes == 1 and not is_torchrun()
+def count_processes(
+    config: DeviceConfig, num_scenarios: int, batch_size: int, micro_batch_size: int, begun_with: int | None = None
+) -> int:
+    """Processes of a run on this machine; the number that "auto" stands for.
 
-    def num_processes(
-        self, num_scenarios: int, batch_size: int, micro_batch_size: int, begun_with: int | None = None
-    ) -> int:
-        """Processes of a run on this machine; the number that "auto" stands for.
-
-        Args:
-            num_scenarios: Number of scenarios in the data set; few are trained on by a single process.
-            batch_size: scenarios of an update; each process needs a scenario.
-            micro_batch_size: scenarios in memory at once, which the processes on a CPU share.
-            begun_with: number of a run that is resumed.
-        """
-        if is_torchrun():
-            return int(os.environ["LOCAL_WORLD_SIZE"])
-        if self.processes != "auto":
-            return self.processes
-        if not (self.forks and can_fork() and self.threads == 1):
-            return 1
-        if begun_with is not None:
-            return begun_with
-        return min(usable_cores(), batch_size, micro_batch_size) if num_scenarios >= MIN_SCENARIOS else 1
+    Args:
+        config: Device settings of the run.
+        num_scenarios: Number of scenarios in the data set; few are trained on by a single process.
+        batch_size: Scenarios of an update; each process needs a scenario.
+        micro_batch_size: Scenarios in memory at once, which the processes on a CPU share.
+        begun_with: Number of processes of a run that is resumed.
+    """
+    if is_torchrun():
+        return int(os.environ["LOCAL_WORLD_SIZE"])
+    if config.processes != "auto":
+        return config.processes
+    if not (forks_processes(config) and can_fork() and config.threads == 1):
+        return 1
+    if begun_with is not None:
+        return begun_with
+    return min(usable_cores(), batch_size, micro_batch_size) if num_scenarios >= MIN_SCENARIOS else 1
 
 
 def can_fork() -> bool:
@@ -146,14 +127,15 @@ def start_fabric(config: DeviceConfig) -> Fabric:
         )
     if config.threads:
         torch.set_num_threads(config.threads)
-    devices, num_nodes = 1 if config.processes == "auto" or config.forks else config.processes, config.num_nodes
+    devices = 1 if config.processes == "auto" or forks_processes(config) else config.processes
+    num_nodes = config.num_nodes
     if is_torchrun():
         # torchrun has started the processes already and says how many there are.
         devices = int(os.environ["LOCAL_WORLD_SIZE"])
         num_nodes = int(os.environ["WORLD_SIZE"]) // devices
     # "ddp" for its process group only: models are not wrapped, gradients are summed by `all_reduce_gradients`.
     fabric = LightningFabric(
-        accelerator="cuda" if config.uses_cuda else "cpu",
+        accelerator="cuda" if uses_cuda(config) else "cpu",
         devices=devices,
         num_nodes=num_nodes,
         strategy="ddp" if devices * num_nodes > 1 else "auto",
@@ -286,3 +268,94 @@ def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> 
     total = all_reduce_sum(torch.cat([g.flatten() for g in gradients]), fabric)
     for gradient, flat in zip(gradients, total.split([g.numel() for g in gradients])):
         gradient.copy_(flat.view_as(gradient))
+
+
+# ---- scenarios by cost: sums are divided by global counts, so that this changes time and memory, never a gradient ----
+
+MAP_POINTS_PER_AGENT = 200
+"""Map points that need about as much memory as an agent; measured 170 (SMART-nano) and 410 (the demo's model) on real
+scenarios."""
+
+
+def scenario_costs(scenarios: Scenarios) -> Float[np.ndarray, "n"]:
+    """Thousands of map points of each scenario, an agent counted as 200: about proportional to memory and time.
+
+    The index of a data set has the counts without a scenario being read; the scenarios of a list are counted here.
+    """
+    counts = count_columns(scenarios, (*AGENT_COLUMNS, "num_map_points"))
+    # Thousands, so that budgets are numbers a person can write.
+    return (counts[-1] + MAP_POINTS_PER_AGENT * counts[:-1].sum(0)) / 1000.0
+
+
+def count_columns(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndarray, "columns n"]:
+    """Counts of each scenario by columns of the index, from the index of a data set without a scenario being read.
+
+    Args:
+        scenarios: a data set, or scenarios of other types, which are counted here.
+        columns: fields of `IndexRow` that are numbers.
+    """
+    if isinstance(scenarios, ScenarioDataset):
+        return np.array([scenarios.index[name].to_pylist() for name in columns], dtype=np.int64)
+    rows = [compute_index_row(scenarios[i], "") for i in range(len(scenarios))]
+    return np.array([[getattr(row, name) for row in rows] for name in columns], dtype=np.int64)
+
+
+def check_scored(scenarios: Scenarios) -> None:
+    """Check before a run begins that the metric, and so a reward, is defined for each scenario.
+
+    Args:
+        scenarios: Training scenarios that a method scores rollouts of.
+
+    Raises:
+        DataError: some have no logged future or no evaluated agent; the first is named.
+    """
+    num_steps, num_evaluated = count_columns(scenarios, ("num_steps", "num_evaluated"))
+    unscored = np.flatnonzero((num_steps < TOTAL_STEPS) | (num_evaluated == 0))
+    if len(unscored):
+        first = scenarios[int(unscored[0])]
+        cause = "no evaluated agent" if first.has_future else f"{first.num_steps} logged steps, its future is withheld"
+        raise DataError(
+            f"scenario {first.scenario_id} has {cause}: no reward is defined for it and {len(unscored) - 1} others of "
+            f"{len(scenarios)}: leave them out, or train on the training split."
+        )
+
+
+def balance_by_cost(costs: Sequence[float] | Float[np.ndarray, "n"], num_groups: int) -> list[list[int]]:
+    """Greedy load balancing: places of a list, in parts of about equal cost, so that no process waits long.
+
+    The most expensive place goes first, each to the part that is cheapest so far; equal costs are dealt out in turn.
+
+    Args:
+        costs: Cost of each item, in any unit.
+        num_groups: Number of groups; some stay empty where items are fewer.
+    """
+    groups: list[list[int]] = [[] for _ in range(num_groups)]
+    spent = np.zeros(num_groups)
+    # Stable, so that all processes deal alike.
+    for index in np.argsort(-np.asarray(costs, float), kind="stable"):
+        cheapest = int(spent.argmin())
+        groups[cheapest].append(int(index))
+        spent[cheapest] += costs[index]
+    return [sorted(group) for group in groups]
+
+
+def micro_batches(
+    items: Sequence[int], costs: Float[np.ndarray, "n"], *, max_count: int, max_cost: float | None
+) -> list[list[int]]:
+    """Scenarios cut into pieces of similar size, the most expensive first, so that running out of memory shows at once.
+
+    Args:
+        items: Indices of the scenarios in the data set.
+        costs: Costs [n] of all scenarios of the data set, thousands of map points.
+        max_count: Scenarios of a batch at most.
+        max_cost: Summed cost of a batch at most; a scenario that costs more is a batch alone. None = no limit.
+    """
+    budget = np.inf if max_cost is None else max_cost
+    batches: list[list[int]] = []
+    # Sorted by cost, neighbors in this order are alike, and little memory goes to padding.
+    for item in sorted(items, key=lambda i: -costs[i]):
+        if batches and len(batches[-1]) < max_count and costs[[*batches[-1], item]].sum() <= budget:
+            batches[-1].append(item)
+        else:
+            batches.append([item])
+    return batches

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.rollout.policy import compute_statistics, encode_like, score_with_reference
+from rlftsim.training.config import FinetuneConfig, Reduction
 from rlftsim.training.experience import Experience
-from rlftsim.training.finetune_config import FinetuneConfig, Reduction
 from rlftsim.training.imitation import accumulate_imitation
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 

@@ -22,7 +22,8 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.jobs.interruption import ctrl_c_blocked
 from rlftsim.jobs.processes import exit_with_parent, portable_error
-from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabric
+from rlftsim.training.config import DeviceConfig
+from rlftsim.training.parallel import Fabric, can_fork, forks_processes, start_fabric
 
 
 @contextmanager
@@ -42,7 +43,7 @@ def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> 
         DataError: A process died.
     """
     fabric, processes = start_fabric(config), config.processes
-    if processes in ("auto", 1) or not config.forks:
+    if processes in ("auto", 1) or not forks_processes(config):
         yield fabric
         return
     if not can_fork():

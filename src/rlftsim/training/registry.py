@@ -7,7 +7,7 @@ from rlftsim.plugins import ExtensionPoint
 from rlftsim.training.method import Method
 
 SHIPPED = {
-    "rlft": "rlftsim.training.finetune:RewardMethod",
+    "rlft": "rlftsim.training.reward:RewardMethod",
     "catk": "rlftsim.training.catk:CatkMethod",
     "road": "rlftsim.training.catk:RoadMethod",
     "gcsl": "rlftsim.training.goal_relabeling:GcslMethod",

@@ -1,7 +1,7 @@
 """The loop of a training run, for every method: resuming, skips, divergence, validation, checkpoints, logs, progress.
 
 A method brings its `Learner` (the weights and counters that change) and makes the updates (`training.method`). A run
-leaves files through `training.run_folder` and `training.checkpoint`.
+leaves files through `training.run_folder`.
 """
 
 import math
@@ -21,14 +21,24 @@ from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
+from rlftsim.training.config import ValidationConfig
 from rlftsim.training.data import share_cache
 from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
-from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
+from rlftsim.training.monitoring import check_validation, validate
+from rlftsim.training.parallel import Fabric, all_reduce_sum, count_processes, forks_processes, num_sharing_memory
 from rlftsim.training.processes import linked_processes
 from rlftsim.training.registry import find_method
-from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
-from rlftsim.training.validation import ValidationConfig, check_validation, validate
+from rlftsim.training.run_folder import (
+    Progress,
+    RunFolder,
+    describe_inputs,
+    flatten,
+    newest_checkpoint,
+    parse_update,
+    read_checkpoint,
+    stored_settings,
+    write_checkpoint,
+)
 
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a run takes: a data set, a list, or a single scenario."""
@@ -79,8 +89,8 @@ def train_policy(
     out = Path(out)
     check_folder(out, "run")
     begun_with = flatten(stored_settings(out)).get("device.processes")
-    processes = settings.device.num_processes(
-        len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
+    processes = count_processes(
+        settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
     )
     settings = replace(settings, device=replace(settings.device, processes=processes))
     work = partial(_make_updates, method, policy, scenarios, out, settings, held_out, card)
@@ -223,7 +233,7 @@ class TrainingRun:
         Raises:
             KeyboardInterrupt: Ctrl-C or a similar signal, when the update is done.
         """
-        waits = self._fabric.world_size == 1 or self._settings.device.forks
+        waits = self._fabric.world_size == 1 or forks_processes(self._settings.device)
         is_shown = self._fabric.is_global_zero
         try:
             with (

@@ -7,7 +7,8 @@ from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.open import open_dataset
-from rlftsim.training.augment import AugmentConfig, augment_goals
+from rlftsim.training.augment import augment_goals
+from rlftsim.training.config import AugmentConfig
 from rlftsim.verbs.arguments import Device
 
 

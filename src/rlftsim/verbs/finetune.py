@@ -12,11 +12,15 @@ from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import to_scenarios
-from rlftsim.training.calibrate import CalibrateConfig
-from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import NOT_VALIDATED, GcslConfig
-from rlftsim.training.imitation import PretrainConfig
+from rlftsim.training.config import (
+    NOT_VALIDATED,
+    CalibrateConfig,
+    CatkConfig,
+    FinetuneConfig,
+    GcslConfig,
+    PretrainConfig,
+    RoadConfig,
+)
 from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe

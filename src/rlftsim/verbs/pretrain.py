@@ -14,7 +14,7 @@ from rlftsim.scenario.any_form import to_scenarios
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.imitation import PretrainConfig
+from rlftsim.training.config import PretrainConfig
 from rlftsim.verbs.arguments import Data, File, Model, ModelOrRecipe, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, find_value

@@ -19,8 +19,7 @@ from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.map_tokens import tokenize_map
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M
 from rlftsim.training.catk_rollouts import roll_out_closest
-from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.parallel import DeviceConfig
+from rlftsim.training.config import DeviceConfig, PretrainConfig
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 

@@ -14,9 +14,9 @@ from rlftsim.policies.smart.network import AgentDecoder
 from rlftsim.rollout.policy import SharingPolicy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
-from rlftsim.training.finetune import prepare, update_policy
 from rlftsim.training.freezing import freeze_untrained
 from rlftsim.training.parallel import start_fabric
+from rlftsim.training.reward import prepare, update_policy
 from tiny_fixtures import drawn_scenarios, vocabulary  # noqa: F401
 
 ROUNDING = 1e-5

@@ -20,9 +20,9 @@ from rlftsim.policies.trafficbots.state import ImposedStates, start_traffic
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import TOTAL_STEPS
+from rlftsim.training.config import ValidationConfig
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
-from rlftsim.training.validation import ValidationConfig
 
 SETTINGS = replace(TINY, steps_per_pass=80, forcing_updates=2)
 PRETRAIN = replace(

@@ -14,7 +14,7 @@ from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.batches import balance_by_cost, check_scored, micro_batches, scenario_costs
+from rlftsim.training.parallel import balance_by_cost, check_scored, micro_batches, scenario_costs
 
 COSTS = st.lists(st.floats(0.1, 100.0), min_size=1, max_size=24)
 

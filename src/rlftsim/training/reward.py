@@ -5,6 +5,8 @@ The main path of this package; `update_policy` is a single update, in seven step
 
 import copy
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,6 +15,7 @@ from torch import nn
 from rlftsim.rewards import parse_reward
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
+from rlftsim.training.config import FinetuneConfig, KlConfig
 from rlftsim.training.experience import (
     Experience,
     UpdateClock,
@@ -23,7 +26,6 @@ from rlftsim.training.experience import (
     missing_rate_name,
     sample_rollouts,
 )
-from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.freezing import (
     check_entropy,
     freeze_untrained,
@@ -31,12 +33,39 @@ from rlftsim.training.freezing import (
     select_trained_modules,
     set_learning_rate,
 )
-from rlftsim.training.goals import StoredGoals, check_goals
+from rlftsim.training.goals import StoredGoals, check_goals, open_augmented
 from rlftsim.training.hindsight import accumulate_hindsight
-from rlftsim.training.method import Method, UpdateReport, UpdateScenarios, check_trainable
+from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
+from rlftsim.training.monitoring import Alarms
 from rlftsim.training.parallel import Fabric, all_reduce_gradients, local_rollouts, num_sharing_memory
 from rlftsim.training.policy_gradient import LossTerms, accumulate_gradients
-from rlftsim.training.reference import RewardLearner, adapt_beta, sync_reference
+
+
+@dataclass(eq=False, kw_only=True)
+class RewardLearner(Learner):
+    """A policy in fine-tuning with the frozen reference, the KL penalty's strength and the alarms."""
+
+    reference: Any
+    beta: float
+    augmented_goals: StoredGoals | None = None
+    """Goals beside the logged endpoints."""
+    alarms: Alarms = field(default_factory=Alarms)
+    warned_terms: set[str] = field(default_factory=set)
+    """Terms of the reward that a message has called not finite."""
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """Modules that a checkpoint holds: the policy and the reference."""
+        return {"policy": self.policy, "reference": self.reference}
+
+    def to_numbers(self) -> dict[str, float]:
+        """Beta and the alarms' running means."""
+        return {"beta": self.beta, **self.alarms.to_numbers()}
+
+    def load_numbers(self, numbers: Mapping[str, float]) -> None:
+        """Take back beta and the alarms' running means."""
+        self.beta = numbers["beta"]
+        self.alarms.load_numbers(numbers)
 
 
 class RewardMethod(Method[FinetuneConfig]):
@@ -54,7 +83,7 @@ class RewardMethod(Method[FinetuneConfig]):
         check_trainable(policy, scenarios, "rewards", is_imitated=settings.imitation_weight > 0, is_rewarded=True)
         select_trained_modules(policy, settings.trained)
         check_goals(policy, settings.goals.probability)
-        augmented = settings.goals.open_augmented(scenarios)
+        augmented = open_augmented(settings.goals, scenarios)
         if settings.entropy_bonus:
             check_entropy(policy, scenarios[0], settings.trained)
         return prepare(policy, settings, fabric.device, augmented)
@@ -174,3 +203,29 @@ def update_policy(
         sync_reference(learner.reference, learner.policy, config.kl.reference_ema)
     clock.lap("step")
     return {**values, "learning_rate": learner.optimizer.param_groups[0]["lr"], **clock.seconds}
+
+
+def adapt_beta(beta: float, kl: float, config: KlConfig) -> float:
+    """Strength of the penalty after an update, within bounds: beta (1 + clip(KL/target - 1, -0.2, 0.2) / horizon).
+
+    Args:
+        beta: strength during the update.
+        kl: KL of the update, nats per decision.
+        config: target, horizon and bounds.
+    """
+    # Clipped, so that one wild update moves beta by at most 0.2 / horizon.
+    error = min(max(kl / config.target - 1.0, -0.2), 0.2)
+    return min(max(beta * (1.0 + error / config.horizon), config.min_beta), config.max_beta)
+
+
+@torch.no_grad()
+def sync_reference(reference: nn.Module, policy: nn.Module, alpha: float) -> None:
+    """Move the reference's weights towards the policy's, in place: alpha * policy + (1 - alpha) * reference.
+
+    Args:
+        reference: Reference, moved in place towards the policy.
+        policy: has the same parameters in the same order.
+        alpha: Weight of the policy, in [0, 1].
+    """
+    for old, new in zip(reference.parameters(), policy.parameters()):
+        old.lerp_(new, alpha)

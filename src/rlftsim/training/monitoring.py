@@ -1,0 +1,312 @@
+"""Monitoring of a run: alarms, closed-loop realism on scenarios held out of training, and the use of the map.
+
+Alarms: a policy that exploits the reward drifts away from the log in ways that a few statistics show. Running means of
+these statistics are compared with those of the run's first updates. The level of an alarm is the drift over the
+threshold, so the alarm is raised from 1 on. A warning is logged once when the alarm is raised; the run goes on.
+
+Validation draws from no random generator that the training uses, so a run ends with the same bits with and without.
+
+Map use: the nats that a model's predictions of logged tokens lose when the whole map is moved far away. A model with a
+low loss may still not read the map: most tokens go straight on or stand still, which history alone predicts. Turning
+tokens tell. Vehicles only, since vehicles follow lanes.
+"""
+
+import copy
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling
+from rlftsim.rollout.simulate import check_sampling, simulate
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import Scenarios
+from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary
+from rlftsim.training.config import AlarmConfig, ValidationConfig
+from rlftsim.training.data import batch_with_futures
+from rlftsim.training.experience import score_rollouts
+from rlftsim.training.parallel import Fabric, all_reduce_sum
+
+
+@dataclass(frozen=True)
+class DriftMonitor:
+    """A statistic that is watched."""
+
+    alarm: str
+    """Name of the alarm in the metrics."""
+    statistic: str
+    """Name of the statistic in the metrics."""
+    words: str
+    """Message for the user, with the values now and at the start."""
+    drift: Callable[[float, float, AlarmConfig], float]
+    """From the values at the start and now to drift over threshold."""
+
+
+DRIFT_MONITORS = (
+    DriftMonitor(
+        "alarm_min_ade",
+        "min_ade_m",
+        "even the best rollouts lie {now:.2f} m from the log, {start:.2f} m at the start",
+        # Relative to the start, as minADE depends on the data; 1e-6 for a start of exactly 0.
+        lambda start, now, limit: (now - start) / (limit.min_ade_rise * max(start, 1e-6)),
+    ),
+    DriftMonitor(
+        "alarm_diversity",
+        "diversity_m",
+        "rollouts become alike: their endpoints scatter by {now:.2f} m, {start:.2f} m at the start",
+        lambda start, now, limit: (start - now) / (limit.diversity_fall * max(start, 1e-6)),
+    ),
+    DriftMonitor(
+        "alarm_red_light",
+        "traffic_light_violation_rate",
+        "{now:.1%} of the evaluated agents run a red light, {start:.1%} at the start",
+        lambda start, now, limit: (now - start) / limit.red_light_rise,
+    ),
+    DriftMonitor(
+        "alarm_speed",
+        "speed_gap_mps",
+        "mean speed differs by {now:+.2f} m/s from the log's, {start:+.2f} m/s at the start",
+        lambda start, now, limit: abs(now - start) / limit.speed_drift_mps,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Running:
+    """Means of a statistic. Values that are not finite leave the means unchanged."""
+
+    start: float = 0.0
+    """Over the first updates."""
+    now: float = 0.0
+    """Over the latest."""
+    count: int = 0
+    """Updates with a finite value."""
+
+    def add(self, value: float, config: AlarmConfig) -> "Running":
+        """The means with a further update.
+
+        Args:
+            value: Value of the statistic in that update; not counted where not finite.
+            config: number of first updates and window.
+        """
+        if not math.isfinite(value):
+            return self
+        count = self.count + 1
+        # A plain mean over the first updates; then the start is frozen and `now` becomes an exponential mean.
+        if count <= config.first_updates:
+            mean = self.start + (value - self.start) / count
+            return Running(mean, mean, count)
+        return replace(self, now=self.now + (value - self.now) / config.window, count=count)
+
+
+@dataclass
+class Alarms:
+    """The watched means of a run, which checkpoints hold."""
+
+    means: dict[str, Running] = field(default_factory=lambda: {m.alarm: Running() for m in DRIFT_MONITORS})
+
+    def watch(self, logged: Mapping[str, float], config: AlarmConfig) -> tuple[dict[str, float], list[str]]:
+        """Take in the statistics of an update.
+
+        Args:
+            logged: metrics of the update, by name.
+            config: Thresholds of the alarms, and the lengths of both means in updates.
+
+        Returns:
+            The level of every alarm, and messages of those that are raised by this update.
+        """
+        levels, raised = {}, []
+        for monitor in DRIFT_MONITORS:
+            previous_mean = self.means[monitor.alarm]
+            mean = self.means[monitor.alarm] = previous_mean.add(logged[monitor.statistic], config)
+            levels[monitor.alarm] = monitor.drift(mean.start, mean.now, config)
+            # Only on the way up, so that an alarm that lasts is one message and not one per update.
+            if levels[monitor.alarm] >= 1 > monitor.drift(previous_mean.start, previous_mean.now, config):
+                raised.append(f"{monitor.alarm}: {monitor.words.format(now=mean.now, start=mean.start)}")
+        return levels, raised
+
+    def to_numbers(self) -> dict[str, float]:
+        """Numbers for a checkpoint."""
+        return {f"{name}.{key}": value for name, mean in self.means.items() for key, value in vars(mean).items()}
+
+    def load_numbers(self, numbers: Mapping[str, float]) -> None:
+        """Take back the numbers of a checkpoint.
+
+        Raises:
+            CheckpointError: A number is missing.
+        """
+        for name in self.means:
+            try:
+                start, now, count = (numbers[f"{name}.{key}"] for key in ("start", "now", "count"))
+            except KeyError as error:
+                raise CheckpointError(
+                    f"progress.json of the newest checkpoint lacks {error}: delete its folder, the run resumes from an "
+                    "older one."
+                ) from None
+            # JSON has one kind of number here: all are floats.
+            self.means[name] = Running(start, now, int(count))
+
+
+# ---- validation ----------------------------------------------------------------------------------------------------
+
+WATCHED = {
+    "validation_rmm": "meta_metric",
+    "validation_kinematic": "kinematic",
+    "validation_interactive": "interactive",
+    "validation_map_based": "map_based",
+    "validation_min_ade_m": "min_average_displacement_error",
+    "validation_unlogged_offroad_rate": "unlogged_offroad_rate",
+}
+"""Logged metric -> field of `RealismResult`."""
+
+
+def check_validation(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
+    """Refuse before a run any cause that would end the run at the first validation.
+
+    Args:
+        model: Model in training, of which a copy simulates.
+        scenarios: Held-out scenarios, at least one.
+        config: Settings of the validation, of which sampling is tried.
+
+    Raises:
+        ConfigError: the model cannot simulate, or not with this sampling, or there is no scenario.
+    """
+    if not isinstance(model, Policy):
+        raise ConfigError(f"{type(model).__name__} cannot simulate, so it cannot be validated: set validation.every=0.")
+    if not len(scenarios):
+        raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
+    if config.top_k is not None:
+        frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
+        check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
+
+
+@torch.no_grad()
+def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric) -> dict[str, float]:
+    """Mean realism of a model's rollouts, and the use of the map; each process takes a part of the scenarios.
+
+    Args:
+        model: a policy; left unchanged, training mode included.
+        scenarios: Held-out scenarios to select from, with futures.
+        config: number and choice of scenarios and rollouts.
+        fabric: Processes of the run, over which sums are added.
+
+    Returns:
+        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
+        predicts tokens the loss and map use on vehicles (`MapUse`), and the seconds taken.
+
+    Raises:
+        DataError: a scenario withholds the future.
+    """
+    from rlftsim.statistics import interval_around  # scipy.stats: half a second that configurations need not pay
+
+    start = time.perf_counter()
+    # A copy, so that neither the mode nor a cache of the model in training changes.
+    frozen: Any = copy.deepcopy(model).eval().requires_grad_(False)
+    # Dealt out in turn: the same scenarios in total for any number of processes.
+    selected = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
+    sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
+    map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
+    for first in range(0, len(selected), config.scenarios_per_pass):
+        batch = batch_with_futures(scenarios, selected[first : first + config.scenarios_per_pass]).to(fabric.device)
+        with fabric.autocast():
+            rollouts = simulate(
+                frozen, batch, num_rollouts=config.num_rollouts, seed=config.seed, sampling=Sampling(top_k=config.top_k)
+            )
+            if map_use is not None:
+                map_use += measure_map_use(frozen, batch)
+        realism, _ = score_rollouts(batch, rollouts, config.metric)
+        values = torch.stack([getattr(realism, name).double() for name in WATCHED.values()], -1)  # [B, metrics]
+        # A scenario may have no finite value of a metric: it is left out of that mean.
+        finite = values.isfinite()
+        values = torch.where(finite, values, 0.0)
+        sums += torch.stack([finite.double(), values, values.square()]).sum(1)
+    count, total, squares = all_reduce_sum(sums, fabric)  # [metrics] each
+    mean = total / count
+    # Standard error of the mean from sums, which can be added over processes; rounding may make it negative.
+    error = ((squares - count * mean.square()).clamp(min=0) / (count - 1) / count).sqrt()
+    low, high = interval_around(float(mean[0]), float(error[0]), int(count[0])).interval
+    logged = dict(zip(WATCHED, mean.tolist())) | {"validation_rmm_low": low, "validation_rmm_high": high}
+    if map_use is not None:
+        logged |= MapUse(all_reduce_sum(map_use.sums, fabric)).to_metrics("validation_")
+    return {**logged, "seconds_validation": time.perf_counter() - start}
+
+
+# ---- map use -------------------------------------------------------------------------------------------------------
+
+AWAY_M = 5000.0
+"""The map is moved by this along both axes: farther than any model looks."""
+TURNING_RAD = 0.06
+"""A token that changes the heading by more than this in its half second is a turning one."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapUse:
+    """Losses of vehicle tokens with and without the map, as sums that add up over batches and processes."""
+
+    sums: Float[Tensor, "2 3"]
+    """Rows: all tokens, turning tokens. Columns: their number, loss with the map, loss without it (nats), float64."""
+
+    @classmethod
+    def zero(cls, device: torch.device | str = "cpu") -> "MapUse":
+        """Sums of no token."""
+        return cls(torch.zeros(2, 3, dtype=torch.float64, device=device))
+
+    def __add__(self, addend: "MapUse") -> "MapUse":
+        return MapUse(self.sums + addend.sums)
+
+    def to_metrics(self, prefix: str = "") -> dict[str, float]:
+        """Mean loss and map use (loss without minus with the map), nats per token, of all and of turning tokens.
+
+        NaN where there was no such token.
+
+        Args:
+            prefix: put before every name.
+        """
+        count, with_map, without = self.sums.T  # [2] each
+        values = {"loss": with_map / count, "map_use": (without - with_map) / count}
+        return {
+            f"{prefix}{name}{suffix}": float(value[row])
+            for name, value in values.items()
+            for row, suffix in enumerate(("", "_turning"))
+        }
+
+
+def predicts_tokens(policy: object) -> bool:
+    """True for a policy with measurable map use: predictions of the tokens of a vocabulary along logged tracks."""
+    return isinstance(policy, PretrainablePolicy) and isinstance(getattr(policy, "vocabulary", None), Vocabulary)
+
+
+@torch.no_grad()
+def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
+    """Cross-entropy of the logged vehicles' tokens, with the map and with the map 5 km away.
+
+    Args:
+        policy: Policy with a vocabulary, in evaluation mode.
+        batch: Scenarios with futures, on the policy's device.
+    """
+    shifted = []
+    for scenario in batch.scenarios:
+        points = scenario.map_features.points + AWAY_M
+        shifted.append(replace(scenario, map_features=replace(scenario.map_features, points=points)))
+    losses, turning = _vehicle_losses(policy, batch)
+    without, _ = _vehicle_losses(policy, collate(shifted).to(batch.device))
+    columns = torch.stack([torch.ones_like(losses), losses, without], -1).double()  # [r, 3]
+    return MapUse(torch.stack([columns.sum(0), columns[turning].sum(0)]))
+
+
+def _vehicle_losses(policy: PretrainablePolicy, batch: ScenarioBatch) -> tuple[Float[Tensor, "r"], Bool[Tensor, "r"]]:
+    """Cross-entropy of each predicted vehicle token, nats; and True where the token turns."""
+    vocabulary: Vocabulary = cast(Any, policy).vocabulary
+    predicted: Prediction = policy.teacher_forced(batch, batch.agent_mask)
+    vehicle = CLASS_NAMES.index("vehicle")
+    rows = predicted.target_mask & (predicted.class_id == vehicle)
+    target = predicted.target[rows]
+    turn = vocabulary.poses[vehicle, target, -1, 2]  # [r], heading at the end of the token, rad
+    return functional.cross_entropy(predicted.logits[rows], target, reduction="none"), turn.abs() > TURNING_RAD
