@@ -17,14 +17,7 @@ from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens import catk_compat
-from rlftsim.tokens.agent_tokens import (
-    HISTORY_TOKENS,
-    AgentTokens,
-    Pose,
-    local_boxes,
-    tokenize_agents,
-    tokens_towards,
-)
+from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, AgentTokens, Pose, local_boxes, tokenize_agents, tokens_towards
 from rlftsim.tokens.vocabulary import Vocabulary, box_of_class, class_of_type
 from rlftsim.training.config import Choice, Targets
 from rlftsim.training.imitation import TargetedRollouts, TokenLogits

@@ -21,11 +21,7 @@ MIN_FUTURE_STEPS = 5
 
 
 def batch_with_futures(
-    scenarios: Scenarios,
-    indices: Sequence[int],
-    *,
-    context_radius_m: float | None = None,
-    mirror: Collection[int] = (),
+    scenarios: Scenarios, indices: Sequence[int], *, context_radius_m: float | None = None, mirror: Collection[int] = ()
 ) -> ScenarioBatch:
     """Batch of some scenarios.
 
