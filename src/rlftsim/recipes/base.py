@@ -13,7 +13,7 @@ pyproject.toml of the package:
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from torch import nn
 
@@ -41,6 +41,8 @@ class Recipe:
     """Sections that every policy has. A subclass adds `model`, the sizes of the policies, and any further field:
     each field that is a dataclass is a section."""
 
+    model_name: ClassVar[str] = "model"
+    """Name of the recipe's models in tables."""
     tokens: TokensConfig | None = None
     """Vocabulary; None for policies without one."""
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
@@ -53,11 +55,6 @@ class Recipe:
     """None likewise."""
     calibrate: CalibrateConfig | None = None
     """None for policies without tokens, whose logits features are added to."""
-
-    @property
-    def model_name(self) -> str:
-        """Name of the recipe's models in tables."""
-        return "model"
 
     @property
     def counterpart(self) -> str | None:
@@ -85,7 +82,7 @@ class Recipe:
     @property
     def free_fields(self) -> tuple[str, ...]:
         """Settings of the section `model` that weights do not depend on."""
-        return ()
+        return getattr(getattr(self, "model", None), "free_fields", ())
 
     def train_further(self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()) -> Policy:
         """The policy that `rlftsim pretrain --init-from` trains: an existing policy, with this recipe's `free_fields`.

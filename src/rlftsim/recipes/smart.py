@@ -31,15 +31,11 @@ from rlftsim.training.config import (
 class SmartRecipe(Recipe):
     """All settings from the vocabulary to the fine-tuned SMART policy."""
 
+    model_name = "SMART"
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
     road: RoadConfig | None = field(default_factory=RoadConfig)
     calibrate: CalibrateConfig | None = field(default_factory=CalibrateConfig)
-
-    @property
-    def model_name(self) -> str:
-        """SMART."""
-        return "SMART"
 
     @property
     def counterpart(self) -> str:
@@ -72,11 +68,6 @@ class SmartRecipe(Recipe):
                 "`rlftsim recipe` lists them."
             )
         return replace(self, model=policy.config)
-
-    @property
-    def free_fields(self) -> tuple[str, ...]:
-        """Numbers and distances of neighbors, and settings of training alone."""
-        return self.model.free_fields
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()

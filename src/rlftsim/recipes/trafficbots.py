@@ -19,14 +19,10 @@ from rlftsim.training.config import CatkConfig, FinetuneConfig, GcslConfig, KlCo
 class TrafficBotsRecipe(Recipe):
     """All settings from fresh weights to the fine-tuned TrafficBots policy, which has neither tokens nor goals."""
 
+    model_name = "TrafficBots V1.5"
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
     gcsl: GcslConfig | None = None
-
-    @property
-    def model_name(self) -> str:
-        """TrafficBots V1.5."""
-        return "TrafficBots V1.5"
 
     @property
     def counterpart(self) -> str:
@@ -56,11 +52,6 @@ class TrafficBotsRecipe(Recipe):
                 "does, `rlftsim recipe` lists them."
             )
         return replace(self, model=policy.config)
-
-    @property
-    def free_fields(self) -> tuple[str, ...]:
-        """Neighborhoods, exploration noise, and settings of training alone."""
-        return self.model.free_fields
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
@@ -64,33 +63,20 @@ def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path,
     return Vocabulary.load(path)
 
 
-def pretrain_policy(
-    policy: Any,
-    training: ScenarioDataset,
-    config: PretrainConfig,
-    out: Path,
-    *,
-    start: str | None = None,
-    held_out: ScenarioDataset | None = None,
-) -> Path:
+def pretrain_policy(policy: Any, training: ScenarioDataset, config: PretrainConfig, out: Path) -> Path:
     """Folder of the model that pre-training makes of a policy.
 
     Args:
-        policy: such as `recipe.new_policy(vocabulary)`; trained in place.
+        policy: Policy with fresh weights, such as `recipe.new_policy(vocabulary)`; trained in place.
         training: Training scenarios of a single data set, with logged futures.
         config: Settings of pre-training; a stored run resumes only with equal settings.
         out: Folder of the run. A run that was stopped there is resumed, a finished run is not repeated.
-        start: Name of the model that gave the policy's weights, for the card; None = fresh weights.
-        held_out: scenarios for validation, see `config.validation`.
 
     Raises:
         CheckpointError: `out` holds a run with other settings.
     """
-    description = "pre-trained" if start is None else f"pre-trained further from {start}"
-    card = model_card(description, training.folder, len(training), start)
-    if isinstance(policy, nn.Module):
-        policy.requires_grad_(True)  # weights of a loaded policy are frozen
-    return train_policy(policy, training, out, config, held_out=held_out, card=card)
+    card = model_card("pre-trained", training.folder, len(training))
+    return train_policy(policy, training, out, config, card=card)
 
 
 def finetune_model(
@@ -100,7 +86,6 @@ def finetune_model(
     out: Path,
     *,
     conditioning: GoalConditioning | None = None,
-    held_out: ScenarioDataset | None = None,
 ) -> Path:
     """Folder of the model that fine-tuning makes of a base model. The type of `config` chooses the method.
 
@@ -111,11 +96,10 @@ def finetune_model(
         out: Folder of the run. A run that was stopped there is resumed, a finished run is not repeated; with a reward
             and more epochs it is trained further.
         conditioning: goal conditioning to add to the base model first; None = as the base model is.
-        held_out: Scenarios for validation, for methods whose settings have a section `validation`.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or a different base model.
-        ConfigError: the base model has no weights or other goal conditioning, or the method has no validation.
+        ConfigError: The base model has no weights or other goal conditioning.
     """
     policy = load_policy(str(base))
     if conditioning is not None:
@@ -123,8 +107,7 @@ def finetune_model(
 
     description = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
     card = model_card(description, training.folder, len(training), base)
-    policy = prepare_policy(policy, config)
-    return train_policy(policy, training, out, config, held_out=held_out, card=card)
+    return train_policy(prepare_policy(policy, config), training, out, config, card=card)
 
 
 def with_conditioning(policy: Any, conditioning: GoalConditioning, seed: int, *, name: object) -> Any:

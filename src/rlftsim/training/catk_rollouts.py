@@ -87,15 +87,9 @@ def roll_out_closest(
         return decision
 
     rollouts = simulate(
-        policy,
-        batch,
-        num_rollouts=num_rollouts,
-        seed=seed,
-        context=context,
-        goals=goals,
-        choose=choose,
+        policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, goals=goals, choose=choose,
         may_be_nan=True,
-    )
+    )  # fmt: skip
     target, mask = (torch.stack(steps, -1) for steps in zip(*decision_targets))  # [B, N, A, L]
     return TargetedRollouts(rollouts, target, mask, batch.object_type)
 

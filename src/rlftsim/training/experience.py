@@ -20,7 +20,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
-from rlftsim.training.config import FinetuneConfig, GoalConfig
+from rlftsim.training.config import FinetuneConfig
 from rlftsim.training.goals import StoredGoals, choose_goals
 from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
 
@@ -56,12 +56,9 @@ class Experience:
 def sample_rollouts(
     policy: Any,
     batch: ScenarioBatch,
-    goals: GoalConfig,
+    config: FinetuneConfig,
     augmented: StoredGoals | None,
-    *,
-    num_rollouts: int,
     rollout_ids: range,
-    seed: int,
     update: int,
     fabric: Fabric,
 ) -> tuple[Any, Rollouts]:
@@ -70,28 +67,21 @@ def sample_rollouts(
     Args:
         policy: decides for all agents.
         batch: scenarios with futures.
-        goals: Settings of goals: probability of an agent to have a goal.
+        config: Settings of goals, number of rollouts, and seed, which determines goals and rollouts with `update`.
         augmented: goals beside the logged endpoints, if any.
-        num_rollouts: N, of each scenario.
         rollout_ids: Rollouts that this process simulates; the rest comes from the processes with the same scenarios.
-        seed: Seed of the run; determines goals and rollouts together with `update`.
         update: Number of the update, from 0.
         fabric: precision of the pass, and the processes.
     """
-    batch_goals = choose_goals(batch, goals, augmented, seed=derive_seed(seed, "goals", update))
+    goals = choose_goals(batch, config.goals, augmented, seed=derive_seed(config.seed, "goals", update))
     with fabric.autocast(), torch.no_grad(), one_thread():
         context = policy.encode(batch)
         rollouts = simulate(
-            policy,
-            batch,
-            num_rollouts=rollout_ids,
-            seed=derive_seed(seed, "rollouts", update),
-            context=context,
-            goals=batch_goals,
-            may_be_nan=True,
-        )
-    if len(rollout_ids) < num_rollouts:
-        rollouts = _gather_rollouts(rollouts, num_rollouts, fabric)
+            policy, batch, num_rollouts=rollout_ids, seed=derive_seed(config.seed, "rollouts", update),
+            context=context, goals=goals, may_be_nan=True,
+        )  # fmt: skip
+    if len(rollout_ids) < config.num_rollouts:
+        rollouts = _gather_rollouts(rollouts, config.num_rollouts, fabric)
     return context, rollouts
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rlftsim.goals.types import Goals
 from rlftsim.realism import RealismResult
-from rlftsim.rewards import Term
+from rlftsim.rewards import Term, parse_reward
 from rlftsim.rewards.goal import goal_advantage, goal_terms
 from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.types import Rollouts
@@ -80,32 +80,22 @@ def importance_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -
 
 
 def accumulate_hindsight(
-    policy: Any,
-    experiences: Sequence[Experience],
-    reward: Sequence[Term],
-    first_pass: GradientSums,
-    terms: LossTerms,
-    fabric: Fabric,
-    *,
-    weight: float,
-    rollouts_per_pass: int,
+    policy: Any, experiences: Sequence[Experience], first_pass: GradientSums, terms: LossTerms, fabric: Fabric
 ) -> dict[str, float]:
     """Add the gradient of the rewards under hindsight's goals to the policy's parameters.
 
     Args:
         policy: scores the relabelled rollouts.
         experiences: Rollouts of this process with rewards, an entry per micro batch.
-        reward: terms of the run's reward.
         first_pass: has the log-probabilities under the old goals.
-        terms: reduction and counts of the update.
+        terms: Settings of the run with the weight of this gradient (0 = no second pass), and counts of the update.
         fabric: Precision of the passes, and processes that sums are added over.
-        weight: Weight of this gradient; 0 = no second pass.
-        rollouts_per_pass: Rollouts of a scenario that are scored at once, as in `accumulate_gradients`.
 
     Returns:
         Metrics: the mean importance ratio. Empty in a run without hindsight.
     """
-    if not weight:
+    config = terms.config
+    if not config.goals.hindsight:
         return {}
     # The gradient is divided by the mean ratio of the whole batch, which is known in the end only: so it is gathered
     # apart from the gradient of the first pass, and added to it when it has its scale.
@@ -114,15 +104,15 @@ def accumulate_hindsight(
     for parameter in parameters:
         parameter.grad = None
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # ratios, agents
-    relabelled = relabel_with_hindsight(experiences, reward)
+    relabelled = relabel_with_hindsight(experiences, parse_reward(config.reward))
     for experience, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
-        for (rollouts, earned), old in zip(experience.slices(rollouts_per_pass), old_log_probs):
+        for (rollouts, earned), old in zip(experience.slices(config.rollouts_per_pass), old_log_probs):
             mask, decides = rollouts.decision_mask, rollouts.decision_mask.any(-1)  # [B, n, A, L], [B, n, A]
             with fabric.autocast():
                 dist = policy.score(encode_like(policy, experience.batch, experience.context), rollouts)
             log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
             ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
-            by_agent = agent_log_prob(log_prob, mask, terms.config.log_prob_reduction)
+            by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)
             fabric.backward(policy_gradient_loss(earned * ratio, by_agent, terms.num_scenarios))
             # Agents that decide nothing have a ratio of exp(0) = 1, which would pull the mean to 1.
             sums += torch.stack([ratio[decides].sum(), decides.sum()])
@@ -130,7 +120,7 @@ def accumulate_hindsight(
     mean = total / max(count, 1.0)
     for parameter, gradient in zip(parameters, first_gradients):
         if parameter.grad is not None:
-            parameter.grad *= weight / max(mean, 1e-6)
+            parameter.grad *= config.goals.hindsight / max(mean, 1e-6)
         if gradient is not None:
             parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)
     return {"hindsight_ratio": mean}

@@ -9,9 +9,8 @@ import copy
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -36,10 +35,6 @@ from rlftsim.training.parallel import Fabric, all_reduce_gradients, all_reduce_s
 
 IMPOSSIBLE = -1e8
 """A token that cannot be chosen has a smaller logit than this."""
-
-
-Predict = Callable[[ScenarioBatch, Bool[Tensor, "B A"]], Prediction | ImitationLoss]
-"""Predictions of tokens, or a finished loss, both differentiable: for a batch and the agents that count."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -128,7 +123,7 @@ class ImitationMethod(Method[Config]):
     def update(self, learner: Imitator, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
         """An optimizer step along the trajectories of the method."""
         start = time.perf_counter()
-        values = update_imitator(learner, scenarios, partial(self.predict, learner), fabric)
+        values = update_imitator(self, learner, scenarios, fabric)
         values["seconds"] = time.perf_counter() - start
         accuracy = f", accuracy {values['accuracy']:.0%}" if "accuracy" in values else ""
         return UpdateReport(values, f"loss {values['loss']:.3f}{accuracy}", "its gradient is not finite")
@@ -169,14 +164,14 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
 
 
 def update_imitator(
-    learner: Imitator, scenarios: UpdateScenarios, predict: Predict, fabric: Fabric
+    method: ImitationMethod[Any], learner: Imitator, scenarios: UpdateScenarios, fabric: Fabric
 ) -> dict[str, float]:
     """Metrics of an optimizer step: sums of losses over micro batches and processes, over the number of predictions.
 
     Args:
+        method: Method that predicts tokens, or brings the loss.
         learner: Model and settings, changed in place.
         scenarios: Scenarios of the update that this process works on.
-        predict: Predictions of a batch for the agents that count, or the loss.
         fabric: Precision of the passes, and processes that sums are added over.
     """
     config, update = learner.config, learner.update
@@ -197,7 +192,7 @@ def update_imitator(
             batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed
         )
         with fabric.autocast():
-            predicted = predict(batch, trained)
+            predicted = method.predict(learner, batch, trained)
         # Outside of autocast, where a cross-entropy is in full precision.
         if not isinstance(predicted, ImitationLoss):
             predicted = summed_loss(predicted, config.label_smoothing, nearby, config.still_weight)

@@ -96,13 +96,7 @@ class GradientSums:
 
 
 def accumulate_gradients(
-    policy: Any,
-    reference: Any,
-    experiences: Sequence[Experience],
-    terms: LossTerms,
-    fabric: Fabric,
-    *,
-    rollouts_per_pass: int,
+    policy: Any, reference: Any, experiences: Sequence[Experience], terms: LossTerms, fabric: Fabric
 ) -> GradientSums:
     """Add this process's gradient of the loss to the policy's parameters.
 
@@ -117,35 +111,33 @@ def accumulate_gradients(
         experiences: Rollouts of this process with rewards, an entry per micro batch.
         terms: Coefficients of the loss, and the global counts that sums are divided by.
         fabric: precision, and the processes that the statistics are summed over.
-        rollouts_per_pass: rollouts of a scenario that are scored at once; changes memory, not the gradient.
     """
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # KL, entropy
     gaps: list[Tensor] = []
     by_experience: list[list[Tensor]] = []
-    num_decisions = max(terms.num_decisions, 1.0)
+    config, num_decisions = terms.config, max(terms.num_decisions, 1.0)
     imitation: dict[str, float] = {}
-    if terms.config.imitation_weight:
+    if config.imitation_weight:
         batches = [experience.batch for experience in experiences]
-        loss = accumulate_imitation(
-            policy, batches, terms.config.imitation_weight, fabric, update=terms.update, seed=terms.config.seed
+        imitation["imitation_loss"] = accumulate_imitation(
+            policy, batches, config.imitation_weight, fabric, update=terms.update, seed=config.seed
         )
-        imitation["imitation_loss"] = loss
     for experience in experiences:
         by_experience.append([])
         with fabric.autocast(), torch.no_grad():
             ref_context = encode_like(reference, experience.batch, experience.context)
-        for rollouts, reward in experience.slices(rollouts_per_pass):
+        for rollouts, reward in experience.slices(config.rollouts_per_pass):
             mask = rollouts.decision_mask  # [B, n, A, L]
-            ref_rollouts = rollouts if terms.config.kl.condition_reference else replace(rollouts, goals=None)
+            ref_rollouts = rollouts if config.kl.condition_reference else replace(rollouts, goals=None)
             with fabric.autocast():
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
                 context = encode_like(policy, experience.batch, experience.context)
                 dist, ref_dist = score_with_reference(policy, context, rollouts, reference, ref_context, ref_rollouts)
             statistics = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
             kl, entropy = masked_sum(statistics.kl, mask), masked_sum(statistics.entropy, mask)
-            by_agent = agent_log_prob(statistics.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
+            by_agent = agent_log_prob(statistics.log_prob, mask, config.log_prob_reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
-            loss = loss + (terms.beta * kl - terms.config.entropy_bonus * entropy) / num_decisions
+            loss = loss + (terms.beta * kl - config.entropy_bonus * entropy) / num_decisions
             # Every slice adds its part; nothing is divided by the number of slices.
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])

@@ -159,10 +159,8 @@ def update_policy(
     for micro_batch in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
         context, rollouts = sample_rollouts(
-            learner.policy, micro_batch, config.goals, learner.augmented_goals,
-            num_rollouts=config.num_rollouts, rollout_ids=rollout_ids,
-            seed=config.seed, update=learner.update, fabric=fabric,
-        )  # fmt: skip
+            learner.policy, micro_batch, config, learner.augmented_goals, rollout_ids, learner.update, fabric
+        )
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
         realism, rewards = compute_reward(micro_batch, rollouts, config)
@@ -175,14 +173,9 @@ def update_policy(
     # pre-training loss where it has a weight.
     terms = LossTerms(*count_decisions(experiences, fabric), learner.beta, learner.update, config)
     learner.optimizer.zero_grad(set_to_none=True)
-    sums = accumulate_gradients(
-        learner.policy, learner.reference, experiences, terms, fabric, rollouts_per_pass=config.rollouts_per_pass
-    )
+    sums = accumulate_gradients(learner.policy, learner.reference, experiences, terms, fabric)
     # 4. Score them again under goals that one of them has met: gradient of the goal reward in hindsight.
-    hindsight = accumulate_hindsight(
-        learner.policy, experiences, parse_reward(config.reward), sums, terms, fabric,
-        weight=config.goals.hindsight, rollouts_per_pass=config.rollouts_per_pass,
-    )  # fmt: skip
+    hindsight = accumulate_hindsight(learner.policy, experiences, sums, terms, fabric)
     all_reduce_gradients(learner.parameters, fabric)
     clock.lap("backward")
     # 5. Take the optimizer's step, or skip it where the gradient is not finite or the KL exploded.

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -119,7 +119,7 @@ def _make_updates(
     learner = method.start(policy, scenarios, settings, fabric)
     update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     with _hold_folder(out, fabric):
-        run = TrainingRun(method.title, policy, scenarios, out, settings, learner, fabric)
+        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric)
         run.resume()
         with run.progress() as is_stopped:
             note = ""
@@ -157,45 +157,39 @@ def _hold_folder(out: Path, fabric: Fabric) -> Iterator[None]:
         yield
 
 
+@dataclass(eq=False)
 class TrainingRun:
     """A run in a folder, new or resumed.
-
-    Args:
-        title: Label of the progress bar.
-        policy: Initial policy; the fingerprint becomes a part of the run's identity.
-        scenarios: Training scenarios; a different data set or order of scenarios is refused.
-        out: Folder of the run.
-        settings: Settings of the method, stored in the folder.
-        learner: Fresh state, brought to the newest checkpoint by `resume`.
-        fabric: Device and processes; only rank 0 writes files.
 
     Raises:
         CheckpointError: The folder belongs to a run with other settings or inputs.
     """
 
-    def __init__(
-        self,
-        title: str,
-        policy: object,
-        scenarios: Scenarios,
-        out: Path,
-        settings: TrainingSettings,
-        learner: Learner,
-        fabric: Fabric,
-    ):
-        self.num_updates = settings.num_updates(len(scenarios))
-        inputs = {**describe_inputs(policy, scenarios), **learner.inputs}
-        self.folder = RunFolder(out, settings, inputs, writes=fabric.is_global_zero, may_grow=learner.may_grow)
-        self._title = title
-        self._settings = settings
-        self._learner = learner
-        self._fabric = fabric
+    title: str
+    """Label of the progress bar."""
+    scenarios: Scenarios
+    """Training scenarios; a different data set or order of scenarios is refused."""
+    out: Path
+    """Folder of the run."""
+    settings: TrainingSettings
+    """Settings of the method, stored in the folder."""
+    learner: Learner
+    """Fresh state, brought to the newest checkpoint by `resume`; the policy's fingerprint is a part of the run's
+    identity."""
+    fabric: Fabric
+    """Device and processes; only rank 0 writes files."""
+
+    def __post_init__(self) -> None:
+        learner, is_first = self.learner, self.fabric.is_global_zero
+        self.num_updates = self.settings.num_updates(len(self.scenarios))
+        inputs = {**describe_inputs(learner.policy, self.scenarios), **learner.inputs}
+        self.folder = RunFolder(self.out, self.settings, inputs, writes=is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
         # Such a run ends with nearly its initial weights, which looks like a method that does not work.
-        if self.num_updates < settings.warmup_updates and fabric.is_global_zero:
+        if self.num_updates < self.settings.warmup_updates and is_first:
             log.warning(
-                f"the run ends after {self.num_updates} of {settings.warmup_updates} warm-up updates, so its weights "
-                "hardly move: raise epochs, or lower warmup_updates."
+                f"the run ends after {self.num_updates} of {self.settings.warmup_updates} warm-up updates, so its "
+                "weights hardly move: raise epochs, or lower warmup_updates."
             )
 
     def resume(self) -> None:
@@ -204,7 +198,7 @@ class TrainingRun:
         Raises:
             CheckpointError: The checkpoint is damaged, or a longer run was begun in the folder.
         """
-        learner, newest = self._learner, newest_checkpoint(self.folder.checkpoints)
+        learner, newest = self.learner, newest_checkpoint(self.folder.checkpoints)
         if newest and parse_update(newest) > self.num_updates:
             shorter = f" The model of the shorter one is {self.folder.model}." if self.folder.has_model else ""
             raise CheckpointError(
@@ -217,11 +211,11 @@ class TrainingRun:
             learner.load_numbers(progress.numbers)
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
-        if self._fabric.is_global_zero and learner.update < self.num_updates:
+        if self.fabric.is_global_zero and learner.update < self.num_updates:
             for name, value in self.folder.grows_from.items():
                 log.info(f"{self.folder.model} stays the model of {value:g} {name} until the run ends.")
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
-            log.info(f"{self._title} {begun}: {self.num_updates} updates of {_count_weights(learner)}.")
+            log.info(f"{self.title} {begun}: {self.num_updates} updates of {_count_weights(learner)}.")
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[], bool]]:
@@ -233,11 +227,11 @@ class TrainingRun:
         Raises:
             KeyboardInterrupt: Ctrl-C or a similar signal, when the update is done.
         """
-        waits = self._fabric.world_size == 1 or forks_processes(self._settings.device)
-        is_shown = self._fabric.is_global_zero
+        waits = self.fabric.world_size == 1 or forks_processes(self.settings.device)
+        is_shown = self.fabric.is_global_zero
         try:
             with (
-                progress_bar(self._title, self.num_updates, self._learner.update, show=is_shown) as self._advance,
+                progress_bar(self.title, self.num_updates, self.learner.update, show=is_shown) as self._advance,
                 ctrl_c_waits(enabled=waits) as is_stopped,
             ):
                 yield is_stopped
@@ -257,28 +251,28 @@ class TrainingRun:
         Raises:
             CheckpointError: The run diverged.
         """
-        learner = self._learner
+        learner = self.learner
         # The line is written first, so that a run that ends here shows why.
         self.folder.log(learner.update, report.values)
-        if self._fabric.is_global_zero:
+        if self.fabric.is_global_zero:
             if learner.skipped_in_a_row:
-                limit = f"{learner.skipped_in_a_row} in a row, the run stops at {self._settings.max_skipped_in_a_row}"
+                limit = f"{learner.skipped_in_a_row} in a row, the run stops at {self.settings.max_skipped_in_a_row}"
                 log.warning(f"update {learner.update} skipped: {report.skipped_because} ({limit})")
             for warning in report.warnings:
                 log.warning(f"update {learner.update}, {warning}")
         # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
-        is_due = (is_last or learner.update % self._settings.checkpoint_every == 0) and not learner.skipped_in_a_row
+        is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
         self._check_divergence(report, has_checked_weights=is_due)
-        if is_due and self._fabric.is_global_zero:
+        if is_due and self.fabric.is_global_zero:
             progress = Progress(learner.update, learner.to_numbers())
             write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
         self._advance(note=report.note)
 
     def _check_divergence(self, report: UpdateReport, *, has_checked_weights: bool) -> None:
         """Raise where more updates make no sense; on every process, or other processes would wait forever."""
-        learner = self._learner
+        learner = self.learner
         # Never more skipped updates than the run has.
-        if learner.skipped_in_a_row >= min(self._settings.max_skipped_in_a_row, self.num_updates):
+        if learner.skipped_in_a_row >= min(self.settings.max_skipped_in_a_row, self.num_updates):
             cause = f"{learner.skipped_in_a_row} updates in a row were skipped, {learner.skip_rule}"
             raise self.folder.diverged(cause, learner.remedy)
         # Not after every update: reading all weights makes a GPU wait.
@@ -292,13 +286,13 @@ class TrainingRun:
         Args:
             card: README of the model folder.
         """
-        learner = self._learner
+        learner = self.learner
         learner.finish()
         self.folder.close()
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds
             learner.policy.load_state_dict(learner.result.state_dict())
-        if self._fabric.is_global_zero:
+        if self.fabric.is_global_zero:
             learner.policy.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model
 
