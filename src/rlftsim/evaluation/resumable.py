@@ -314,7 +314,7 @@ def finish_result(
                     title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress
                 )
                 result = combine(stored)
-                remove_temporaries(path)
+                remove_temporaries([path])
                 result.write(path)
             # Only now: an interruption between the two leaves the groups, and the next call finds the result.
             _remove_groups(format, scenario_ids, runner)
