@@ -96,6 +96,20 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
                 temporary.unlink()
 
 
+def check_result_file(path: Path) -> None:
+    """Check that a path at which a result is read or written is a file, if anything: a pipe would wait for ever.
+
+    Args:
+        path: File of a result; may be missing.
+
+    Raises:
+        DataError: A folder, a pipe or a device.
+    """
+    if path.exists() and not path.is_file():
+        meaning = "a folder" if path.is_dir() else "a pipe or device"
+        raise DataError(f"{path} is {meaning}, not a file: choose another --out or name, or remove it.")
+
+
 def temporary_path(path: Path) -> Path:
     """Name for a file that is not whole yet: unique to this process, on all machines that see the folder."""
     # Beside the file, as a rename is atomic within a file system only.

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, Protocol, TextIO, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -61,12 +61,12 @@ def _printable_lines(text: str) -> str:
     return "\n".join(map(printable, text.split("\n")))
 
 
-def print_line(text: object, file: TextIO | None = None) -> None:
+def print_line(text: object, file: Any = None) -> None:
     """Print a line without control characters, such as those of an id or a file name that a user's file holds.
 
     Args:
         text: Line, or an object that is shown by its text; a line break in it becomes a space.
-        file: Stream; None = standard output.
+        file: Stream of text; None = standard output.
     """
     print(printable(str(text)), file=file)
 

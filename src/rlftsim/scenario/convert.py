@@ -19,7 +19,7 @@ from pathlib import Path
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
 from rlftsim.jobs.documents import parse_json, read_json
-from rlftsim.jobs.files import remove_temporaries
+from rlftsim.jobs.files import check_result_file, remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, check_name
 from rlftsim.jobs.items import ResultFormat, run_items
 from rlftsim.jobs.runner import Runner, check_finished, choose_runner, select_items, usable_cores
@@ -254,6 +254,7 @@ def _find_finished(folder: Path) -> dict[str, _FinishedShard]:
     earlier = _earlier_manifest(folder)
     shards = {entry.file: _FinishedShard(entry, earlier.provenance) for entry in earlier.shards}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
+        check_result_file(path)
         with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
             receipt = read_json(path, "convert again")
             settings = receipt.pop("settings")

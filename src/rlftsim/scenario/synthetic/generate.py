@@ -189,9 +189,8 @@ def generate(
             format=WholeFiles(shards, attrgetter("shard_name"), ShardReader, attrgetter("num_scenarios")),
             show_progress=show_progress,
         )  # fmt: skip
-        remove_temporaries(
-            [marker, *paths, *(folder / name for name in (INDEX, MANIFEST))]
-        )  # of processes that were killed
+        # of processes that were killed
+        remove_temporaries([marker, folder / INDEX, folder / MANIFEST, *paths])
 
         # 3. Index and manifest.
         entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]
