@@ -206,7 +206,7 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
         detail = f"lane {lane} has {count[bad[0]]} different states at step {step}{_and_more(len(bad))}"
         yield Finding(Problem.CONTRADICTORY_LIGHTS, where, detail)
 
-    contradictions = describe_contradictions(tracks)
+    contradictions = describe_contradictions(tracks, scenario.map_features, scenario.guessed)
     if contradictions:
         yield Finding(Problem.CONTRADICTORY_MOTION, where, contradictions)
 

@@ -203,11 +203,11 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
     if ego < 0 or not tracks.valid[ego, CURRENT_STEP]:
         raise row.error(0, f"no ego: object {ego_id} is not there 1 s after step {first_step}, the current step")
     _refuse_edges_that_run_backwards(parts[MAP], map_features)
-    contradictions = describe_contradictions(tracks)
+    contradictions = describe_contradictions(tracks, map_features, guessed)
     if contradictions:
         raise DataError(
             f"{TRACKS}: {contradictions}: vx and vy are m/s along x and y of the same frame, headings radians "
-            f"counter-clockwise from +x, and step_s in {SCENARIOS} the seconds between two steps"
+            f"counter-clockwise from +x, z m from the map's level, and step_s in {SCENARIOS} the seconds between two steps"
         )
     if "predict" in row and row["predict"][0] is not None:
         predicted = _find_indices(row, "predict", tracks)
