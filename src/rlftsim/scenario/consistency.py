@@ -25,6 +25,8 @@ DRIVING_MPS = 3.0
 LEAST_COSINE = math.cos(math.pi / 4)
 MAX_CLIMB_M = 2.0
 """In 0.1 s; no track of 573 real and synthetic scenarios climbs or falls by more than 0.8."""
+MAX_SAMPLES = 100
+"""Points between two of a feature; a longer gap is a mistake."""
 MAP_RADIUS_M, MAX_RISE_M = 10.0, 5.0
 """A track is off the map's heights where all its points within 10 m are more than 5 m above or below; in the same
 scenarios none is off by more than 4.1."""
@@ -120,7 +122,7 @@ def _sample_points(map_features: MapFeatures) -> Float[np.ndarray, "n 3"]:
     steps[ends[ends >= 0]] = 0.0
     with np.errstate(invalid="ignore"):
         length_m = np.hypot(steps[:, 0], steps[:, 1])
-        count = np.where(np.isfinite(length_m), np.ceil(length_m / MAP_RADIUS_M), 0.0).astype(np.int64).clip(min=1)
+        count = np.nan_to_num(np.ceil(length_m / MAP_RADIUS_M)).clip(1, MAX_SAMPLES).astype(np.int64)
         index = np.repeat(np.arange(len(points)), count)
         first = np.repeat(np.cumsum(count) - count, count)
         points = points[index] + ((np.arange(len(index)) - first) / count[index])[:, None] * steps[index]

@@ -207,7 +207,7 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
     if contradictions:
         raise DataError(
             f"{TRACKS}: {contradictions}: vx and vy are m/s along x and y of the same frame, headings radians "
-            f"counter-clockwise from +x, z m from the map's level, and step_s in {SCENARIOS} the seconds between two steps"
+            f"counter-clockwise from +x, z m as the map's, and step_s in {SCENARIOS} the seconds between two steps"
         )
     if "predict" in row and row["predict"][0] is not None:
         predicted = _find_indices(row, "predict", tracks)
