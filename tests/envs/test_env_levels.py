@@ -21,10 +21,10 @@ BELOW = Mover(x_m=43.4, y_m=0.3, heading_rad=math.pi / 2, speed_mps=0.0)
 AHEAD = Mover(x_m=60.0, y_m=0.2, speed_mps=9.3)
 
 
-def bridge(*movers, up=(0,), road=ROAD, **scenario):
-    """The ego's road 6 m above the one that crosses it, or `road` in its place, and the tracks `up` on it."""
+def bridge(*movers, up=(0,), road=ROAD, height_m=6.0, **scenario):
+    """The ego's road above the one that crosses it, or `road` in its place, and the tracks `up` on it."""
     drawn = build_scenario("bridge", movers, junction_map(), **scenario)
-    return raised(drawn, lambda x: np.full_like(x, 6.0), road, up)
+    return raised(drawn, lambda x: np.full_like(x, height_m), road, up)
 
 
 def ramp(*movers):
@@ -55,6 +55,18 @@ def test_a_parked_car_under_or_over_the_road_is_not_met(road, up):
     assert (result.planner.time_to_collision, result.planner.least_ttc_s) == (1.0, 3.0)
     assert result.planner.nuplan_style > 0.8
     assert driven("replay", build_scenario("flat", (EGO, BELOW), junction_map())).planner.at_fault_collision_rate == 1.0
+
+
+@pytest.mark.parametrize(("height_m", "meets"), [(1.5, True), (1.65, False), (2.4, False)])
+def test_boxes_meet_where_their_heights_overlap(height_m, meets):  # all boxes are 1.6 m high
+    result = driven("replay", bridge(EGO, BELOW, height_m=height_m))
+    assert (len(result.record.collisions), result.planner.least_ttc_s < 3.0) == (meets, meets)
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+def test_planners_drive_over_a_roof_just_below(name):
+    below = driven(name, bridge(EGO, BELOW, height_m=1.65)).record.agent_motion
+    np.testing.assert_array_equal(below, driven(name, bridge(EGO, height_m=1.65)).record.agent_motion)
 
 
 def test_films_mark_no_overlap_of_cars_above_each_other():

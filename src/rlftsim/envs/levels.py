@@ -13,12 +13,15 @@ from scipy.spatial import KDTree
 from rlftsim.realism.map_based import HEIGHT_STRETCH
 
 CELL_M = 5.0
+LEAST_GAP_M = 1.0
+"""Ground heights within a cell that differ by more than this are levels: one box may stand below another. Of 287 real
+scenarios 6 have such, in nine of ten it is less than 0.6."""
 LEVEL_M = 2.5
-"""Ground heights within a cell that differ by more than this are levels."""
+"""Lanes within this height of an agent's ground are on its level: maps and boxes are inexact. Boxes meet by heights."""
 STEP_UP_M = 1.5
 """Largest step of the ground that an agent follows; beyond it the agent keeps its height."""
-GRADE = 0.15
-"""Height per meter that a slope beside a route may gain."""
+GRADE, FLAT_M = 0.15, 2.0
+"""Height per meter that a slope beside a route may gain, farther from it than its points are apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,7 @@ def build_levels(ground: Float[np.ndarray, "p 3"]) -> Levels | None:
     Args:
         ground: Points on the ground.
     """
-    if not len(ground) or np.ptp(ground[:, 2]) <= LEVEL_M:
+    if not len(ground) or np.ptp(ground[:, 2]) <= LEAST_GAP_M:
         return None
     # two points within half a cell of each other share a cell of one of four grids
     for shift in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
@@ -68,7 +71,7 @@ def build_levels(ground: Float[np.ndarray, "p 3"]) -> Levels | None:
         order = np.lexsort((row, column))
         first = np.flatnonzero(np.append(True, (np.diff(column[order]) != 0) | (np.diff(row[order]) != 0)))
         z = ground[order, 2]
-        if (np.maximum.reduceat(z, first) - np.minimum.reduceat(z, first)).max() > LEVEL_M:
+        if (np.maximum.reduceat(z, first) - np.minimum.reduceat(z, first)).max() > LEAST_GAP_M:
             return Levels(KDTree(ground * [1.0, 1.0, HEIGHT_STRETCH]))
     return None
 
@@ -119,7 +122,8 @@ class RouteHeights:
         """
         is_near_route = self.distance < distances
         rise = np.where(is_near_route, self.above_route - above_route[:, None], self.z - ground[:, None])
-        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, distances), 0.0)
+        beside = np.maximum(np.minimum(self.distance, distances) - FLAT_M, 0.0)
+        return np.maximum(np.abs(rise) - GRADE * beside, 0.0)
 
 
 def is_on_level(difference: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
