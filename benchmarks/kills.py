@@ -30,11 +30,19 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-from rlftsim.cli import augment, data, results, simulate, submit  # noqa: F401 (so that forked commands need not import them)
 from rlftsim.cli.main import main as rlftsim
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.tfrecord import write_records
+from rlftsim.verbs import (  # noqa: F401 (so that forked commands need not import them)
+    augment,
+    convert,
+    evaluate,
+    score,
+    simulate,
+    submit,
+    synthesize,
+)  # fmt: skip
 
 NUM_FILES = 6
 LIMIT_S = 400.0
@@ -147,7 +155,12 @@ def start(words, log):
 def start_fork_server():
     """Start the server that workers are forked from, for all commands that this process forks."""
     forkserver.set_forkserver_preload(
-        [f"rlftsim.cli.{name}" for name in ("augment", "data", "results", "simulate", "submit")]
+        [
+            *(
+                f"rlftsim.verbs.{name}"
+                for name in ("augment", "convert", "evaluate", "score", "simulate", "submit", "synthesize")
+            ),
+        ]
     )
     forkserver.ensure_running()
     forkserver._forkserver.ensure_running = lambda: None  # a forked command finds it by its address

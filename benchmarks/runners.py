@@ -180,10 +180,10 @@ def row_ray_kills(options):
 
 def row_plan(options):
     """The forecast of an evaluation beside the evaluation."""
-    from rlftsim.cli.plan import measure_cost
     from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
     from rlftsim.policies.registry import load_policy
     from rlftsim.scenario.dataset import ScenarioDataset
+    from rlftsim.verbs.plan import measure_cost
 
     cost = measure_cost("evaluate", options.model, "synthetic", 5)
     total = len(ScenarioDataset("synthetic", options.split))

@@ -267,7 +267,7 @@ def simulated(policy: Any, batch: Any, job: Job) -> tuple[Any, list[Any]]:
     """The context of a batch and its rollouts, pass by pass."""
     import torch
 
-    from rlftsim.cli.results import EvaluateConfig
+    from rlftsim.evaluation.results import EvaluateConfig
     from rlftsim.rollout.policy import Sampling
     from rlftsim.rollout.simulate import simulate
 

@@ -45,7 +45,7 @@ def build(folder, jobs=1, delete_parts=False):
     config = EvaluateConfig(split="testing", jobs=jobs)
     plan = make_plan(data, fingerprint_policy(policy), METADATA, config, num_shards=NUM_SHARDS, round_m=None)
     job = Job(policy, data, plan, METADATA, config, None, folder)
-    return build_archive(job, delete_parts=delete_parts, show_progress=False).read_bytes()
+    return build_archive(job, is_deleting=delete_parts, show_progress=False).read_bytes()
 
 
 def cpu_seconds(work, at_least=1.0):

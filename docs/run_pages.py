@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.cli.main import main as rlftsim
-from rlftsim.cli.plugins import POINTS
+from rlftsim.verbs.plugins import POINTS
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("[1-9]*.md"))

@@ -20,13 +20,14 @@ from pathlib import Path
 
 import rlftsim
 from rlftsim import errors
-from rlftsim.cli.main import EXAM, OVERVIEW, VERBS, main
+from rlftsim.cli.main import OVERVIEW, VERBS, main
 from rlftsim.cli.mistakes import ACTIONS
-from rlftsim.cli.plugins import POINTS
 from rlftsim.plugins import is_ours
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.recipes.registry import RECIPES
-from rlftsim.recipes.settings import field_documentation, list_sections, summarize_docstring
+from rlftsim.recipes.settings import list_sections
 from rlftsim.training.run_folder import to_plain
+from rlftsim.verbs.plugins import POINTS
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "build" / "pages" / "reference"
@@ -81,10 +82,9 @@ def help_of(*words: str) -> str:
 def cli_page(verb: str) -> str:
     """Usage and flags of a verb and of its actions."""
     text = help_of(verb)
-    actions = ACTIONS.search(text)
+    actions = ACTIONS.search(text) or ("", "exam" if verb == "experiment" else "")
     parts = [f"# rlftsim {verb}\n", described(text)]
-    of_verb = [name.removeprefix(f"{verb} ") for name in EXAM if name.startswith(f"{verb} ")]
-    for action in (*(actions[1].split(",") if actions else ()), *of_verb):
+    for action in filter(None, actions[1].split(",")):
         parts += [f"## rlftsim {verb} {action}\n", described(help_of(verb, action))]
     return "\n".join(parts)
 
@@ -156,7 +156,7 @@ def fields_page() -> str:
 
 def settings_of(config: object, prefix: str = "") -> Iterator[tuple[str, tuple[object, str]]]:
     """Dotted name, value and documentation of each field of a dataclass."""
-    documentation = field_documentation(type(config))
+    documentation = read_field_texts(type(config))
     for field in fields(config):
         value, name = getattr(config, field.name), f"{prefix}{field.name}"
         if is_dataclass(value):

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from rlftsim.cli.plugins import POINTS
 from rlftsim.plugins import is_ours
+from rlftsim.verbs.plugins import POINTS
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """Of the system; None = the one of `playwright install chromium`."""

@@ -831,6 +831,15 @@ def _with_bad_offset(data: bytes) -> bytes:
     return bytes(mutant)
 
 
+def _compressed(data: bytes) -> bytes:
+    """A shard of some kB whose batches unfold to 3 GB."""
+    batch, sink = pa.record_batch({"a": [bytes(1 << 28)]}), io.BytesIO()
+    with pa.ipc.new_file(sink, batch.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as writer:
+        for _ in range(12):
+            writer.write_batch(batch)
+    return sink.getvalue()
+
+
 def _long_record(data: bytes) -> bytes:
     length = struct.pack("<Q", 1 << 50)
     return length + struct.pack("<I", masked_crc32c(length)) + data
@@ -858,7 +867,11 @@ HOSTILE: Mapping[str, Mapping[str, Change]] = {
         "a footer of 4 GB": lambda data: data[:-8] + b"\xff\xff\xff\xffPAR1",
         "frame alone": lambda data: b"PAR1PAR1",
     },
-    "shard": {"a negative offset": _with_bad_offset, "frame alone": lambda data: b"ARROW1\x00\x00ARROW1"},
+    "shard": {
+        "a negative offset": _with_bad_offset,
+        "frame alone": lambda data: b"ARROW1\x00\x00ARROW1",
+        "compressed": _compressed,
+    },
     "tfrecord": {"a record of 1 PB": _long_record},
     "submission": {"a field of 2 GB": lambda data: b"\x0a\xff\xff\xff\xff\x07" + data},
     "rollouts": {"a field of 2 GB": lambda data: b"\x0a\xff\xff\xff\xff\x07" + data},

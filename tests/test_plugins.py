@@ -13,11 +13,11 @@ import pytest
 
 import third_party
 from rlftsim.cli.main import main
-from rlftsim.cli.plugins import POINTS
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.rewards.base import reward_by_name
+from rlftsim.verbs.plugins import POINTS
 
 ROOT = Path(__file__).parents[1]
 GROUP = "rlftsim.test_colors"

@@ -50,11 +50,6 @@ __all__ = [
 ]
 
 _MODULES = {
-    "rlftsim._api.evaluation": ("compare", "evaluate"),
-    "rlftsim._api.look": ("check_policy", "score"),
-    "rlftsim._api.loop": ("simulate",),
-    "rlftsim._api.sources": ("load_dataset", "load_policy"),
-    "rlftsim._api.train": ("finetune", "pretrain", "recipe"),
     "rlftsim.errors": ("RlftsimError",),
     "rlftsim.evaluation.results": ("Evaluation",),
     "rlftsim.goals.types": ("Goals",),
@@ -68,6 +63,14 @@ _MODULES = {
     "rlftsim.scenario.types": ("Scenario",),
     "rlftsim.studio.notebook": ("open_studio",),
     "rlftsim.training.finetune_config": ("FinetuneConfig",),
+    "rlftsim.verbs.check_policy": ("check_policy",),
+    "rlftsim.verbs.compare": ("compare",),
+    "rlftsim.verbs.evaluate": ("evaluate",),
+    "rlftsim.verbs.finetune": ("finetune", "pretrain"),
+    "rlftsim.verbs.inputs": ("load_dataset", "load_policy"),
+    "rlftsim.verbs.recipe": ("recipe",),
+    "rlftsim.verbs.score": ("score",),
+    "rlftsim.verbs.simulate": ("simulate",),
     "rlftsim.viewer.notebook": ("show",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -1,15 +1,5 @@
 """The public names for editors and type checkers; `__init__.py` loads them. A test holds both together."""
 
-from rlftsim._api.evaluation import compare as compare
-from rlftsim._api.evaluation import evaluate as evaluate
-from rlftsim._api.look import check_policy as check_policy
-from rlftsim._api.look import score as score
-from rlftsim._api.loop import simulate as simulate
-from rlftsim._api.sources import load_dataset as load_dataset
-from rlftsim._api.sources import load_policy as load_policy
-from rlftsim._api.train import finetune as finetune
-from rlftsim._api.train import pretrain as pretrain
-from rlftsim._api.train import recipe as recipe
 from rlftsim.errors import RlftsimError as RlftsimError
 from rlftsim.evaluation.results import Evaluation as Evaluation
 from rlftsim.goals.types import Goals as Goals
@@ -25,6 +15,16 @@ from rlftsim.scenario.dataset import write_dataset as write_dataset
 from rlftsim.scenario.types import Scenario as Scenario
 from rlftsim.studio.notebook import open_studio as open_studio
 from rlftsim.training.finetune_config import FinetuneConfig as FinetuneConfig
+from rlftsim.verbs.check_policy import check_policy as check_policy
+from rlftsim.verbs.compare import compare as compare
+from rlftsim.verbs.evaluate import evaluate as evaluate
+from rlftsim.verbs.finetune import finetune as finetune
+from rlftsim.verbs.finetune import pretrain as pretrain
+from rlftsim.verbs.inputs import load_dataset as load_dataset
+from rlftsim.verbs.inputs import load_policy as load_policy
+from rlftsim.verbs.recipe import recipe as recipe
+from rlftsim.verbs.score import score as score
+from rlftsim.verbs.simulate import simulate as simulate
 from rlftsim.viewer.notebook import show as show
 
 __version__: str

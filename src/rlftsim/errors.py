@@ -72,13 +72,13 @@ def shorten(text: str, most: int = MAX_MESSAGE) -> str:
     return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
-def place_of(error: BaseException) -> str:
+def locate_error(error: BaseException) -> str:
     """File, line and function where an error that was raised began; torch's code and Python's import are left out."""
     # A wrong shape is noticed inside torch, but made by the code that called it.
     foreign = (f"{os.sep}site-packages{os.sep}torch{os.sep}", "<frozen ")
     frames = traceback.extract_tb(error.__traceback__)
-    place = [one for one in frames if not any(part in one.filename for part in foreign)][-1]
-    return f"{os.path.basename(place.filename)}:{place.lineno} in {place.name}"
+    frame = [frame for frame in frames if not any(folder in frame.filename for folder in foreign)][-1]
+    return f"{os.path.basename(frame.filename)}:{frame.lineno} in {frame.name}"
 
 
 def whole_number(name: str, value: object, least: int | None = None) -> int:

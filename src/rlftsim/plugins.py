@@ -23,7 +23,7 @@ from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
 from typing import Generic, TypeVar
 
-from rlftsim.errors import ConfigError, in_short, place_of
+from rlftsim.errors import ConfigError, in_short, locate_error
 
 Value = TypeVar("Value")
 Registered = TypeVar("Registered")
@@ -153,7 +153,7 @@ class ExtensionPoint(Generic[Value]):
             package = f" of package {entry.dist.name} {entry.dist.version}" if entry.dist else ""
             return (
                 f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported "
-                f"({type(error).__name__}: {error}, {place_of(error)}): repair or uninstall the package."
+                f"({type(error).__name__}: {error}, {locate_error(error)}): repair or uninstall the package."
             )
         if value is None:
             return f"{self.kind} {entry.name!r} ({entry.value}) is None: name an object or a module."
@@ -174,7 +174,7 @@ class ExtensionPoint(Generic[Value]):
         except ConfigError as error:
             return str(error)
         except (Exception, SystemExit) as error:
-            return f"{self.kind} {name!r} fails ({type(error).__name__}: {error}, {place_of(error)}): repair it."
+            return f"{self.kind} {name!r} fails ({type(error).__name__}: {error}, {locate_error(error)}): repair it."
         return None
 
 

@@ -12,11 +12,12 @@ import typing
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
 from rlftsim import __version__
-from rlftsim.cli.goals import Choice
 from rlftsim.cli.main import VERBS, main
 from rlftsim.cli.recipe_verb import with_settings
 from rlftsim.cli.train import Pretrain
@@ -29,6 +30,7 @@ from rlftsim.scenario.open import SYNTHETIC, open_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics
+from rlftsim.verbs.goals import Choice
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -100,6 +102,43 @@ def evaluation(tmp_path, capsys):
     assert status == 0, err
     assert "oracle.parquet" in out
     return tmp_path / "e" / "oracle.parquet"
+
+
+def test_a_file_that_is_no_evaluation_is_never_replaced(evaluation, tmp_path, capsys):
+    damaged, foreign = tmp_path / "d" / "damaged.parquet", tmp_path / "d" / "tracks.parquet"
+    foreign.parent.mkdir()
+    pq.write_table(pa.table({"track": [1, 2]}), foreign)
+    damaged.write_bytes(evaluation.read_bytes()[:-100])
+    for path, cause in ((foreign, "not an evaluation of this version"), (damaged, "cannot be read (.*)")):
+        before = path.read_bytes()
+        status, _, err = run(
+            capsys, "evaluate", "oracle", "--data", "synthetic", "--limit", "1", "--out", path.parent,
+            "--name", path.stem,
+        )  # fmt: skip
+        assert (status, len(err.splitlines())) == (2, 1)
+        assert re.search(rf"{path} is in the way \({cause}\): choose another --out, or remove the file", err)
+        assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "evaluate oracle --data synthetic --limit 1 --out OUT",
+        "simulate constant_velocity --data synthetic --limit 1 --out OUT",
+        "convert OUT destination",
+        "score OUT --data synthetic",
+        "finetune smart-demo --model demo-base --data synthetic --out OUT",
+        "submit build constant_velocity --data synthetic --i-comply --out OUT",
+        "join simulate constant_velocity --data synthetic --out OUT",
+    ],
+)
+def test_a_path_that_is_no_text_is_refused_in_one_line(words, tmp_path, capsys):
+    out = tmp_path / os.fsdecode(b"ev\xff")
+    status, _, err = run(capsys, *words.replace("OUT", str(out)).split())
+    assert status == 2
+    assert err.endswith("ev\\udcff' is no text in UTF-8: rename the file or folder.\n")
+    assert len(err.splitlines()) == 1
+    assert not out.exists()
 
 
 WRONG = {
@@ -206,13 +245,14 @@ WRONG = {
         "simulate constant_velocity --data synthetic --out {tmp}/whose",
         "rollouts.json: not JSON.*: name another --out",
     ),
+    "a flag of a forecast that was not asked for": ("doctor --nodes 4", "--nodes has no effect: add --plan evaluate"),
     "an unknown metric": (
         "evaluate oracle --data synthetic --out {tmp}/o --metric 1999",
         "Unknown metric '1999': known are 2025",
     ),
     "no rollouts": (
         "evaluate oracle --data synthetic --out {tmp}/o --num-rollouts 0",
-        "num_rollouts must be at least 1",
+        "--num-rollouts must be at least 1, got 0",
     ),
     "no rollouts to simulate": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --num-rollouts 0",
@@ -359,14 +399,14 @@ def test_what_stops_a_verb_is_one_line(error, expected, line, capsys, monkeypatc
     def stop(*_, **__):
         raise error
 
-    monkeypatch.setattr("rlftsim.cli.data.dataset_stats", stop)
+    monkeypatch.setattr("rlftsim.verbs.data.dataset_stats", stop)
     status, _, err = run(capsys, "data", "stats", "synthetic")
     assert (status, err.strip().count("\n")) == (expected, 0)
     assert err.strip().startswith(line)
 
 
 def test_a_bug_keeps_its_traceback(capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.data.dataset_stats", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("rlftsim.verbs.data.dataset_stats", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run(capsys, "data", "stats", "synthetic")
 
@@ -517,7 +557,7 @@ def test_rollouts_that_are_damaged_are_simulated_again(tmp_path, capsys, damage)
     cut.write_bytes(damage(whole))
     status, _, err = run(capsys, *arguments, "--scenario", *names)
     assert status == 0
-    assert f"{cut} is simulated again: " in err
+    assert f"{cut} has to be made again: " in err
     with np.load(cut) as again, np.load(io.BytesIO(whole)) as before:
         assert again.files == before.files
         assert all(np.array_equal(again[name], before[name]) for name in again.files)
@@ -673,7 +713,7 @@ class GoalConditioned(ConstantVelocity):
 
 
 def test_a_goal_is_given_to_the_model_and_its_outcome_is_printed(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--scenario", SCENARIO, "--num-rollouts", "2"]
     goals = ["--goal", f"{TURNS}=-74.19,19.77", "--goal", "52=3.28,-4.49"]
     status, out, err = run(capsys, *arguments, "--out", tmp_path / "o", *goals, "--picture")
@@ -689,7 +729,7 @@ def test_a_goal_is_given_to_the_model_and_its_outcome_is_printed(tmp_path, capsy
 
 
 def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     run(capsys, "goals", "propose", "synthetic", "--scenario", SCENARIO, "--out", tmp_path / "g.json")
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--out", tmp_path / "o", "--num-rollouts", "1"]
     status, out, _ = run(capsys, *arguments, "--goals", tmp_path / "g.json")
@@ -699,7 +739,7 @@ def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monk
 
 
 def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.results.load_policy_or_oracle", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.evaluate.load_policy_or_oracle", lambda *_: GoalConditioned())
     arguments = [
         "evaluate",
         "goal-seeker",
@@ -738,7 +778,7 @@ def goals_file(path, *goals, alternatives=()):
 @pytest.fixture
 def simulated(tmp_path, capsys, monkeypatch):
     """Runs `simulate` with a model that drives to its goals; returns status, output and errors."""
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: GoalConditioned())
+    monkeypatch.setattr("rlftsim.verbs.inputs.load_policy", lambda *_: GoalConditioned())
     common = ["simulate", "goal-seeker", "--data", "synthetic", "--num-rollouts", "2", "--out", tmp_path / "o"]
     return lambda *arguments: run(capsys, *common, *arguments)
 

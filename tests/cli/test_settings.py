@@ -157,7 +157,6 @@ BAD = [
     (["finetune", "smart-dmo", "--model", "m"], "unknown recipe 'smart-dmo': did you mean 'smart-demo'"),
     (["tokens", "--recipe", "smarttiny", "--data", "d"], "unknown recipe 'smarttiny': did you mean 'smart-tiny'"),
     (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
-    (["doctor", "--nodes", "4"], "^--nodes has no effect: add --plan evaluate"),
     (
         ["join"],
         "^join: write the command of a share behind join, .* are augment, convert, evaluate, score, simulate,",

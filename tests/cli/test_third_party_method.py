@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.method import METHODS, method_by_name
+from rlftsim.training.registry import METHODS, method_by_name
 from rlftsim.training.run_folder import read_metrics
 from third_party import installed
 

@@ -276,7 +276,7 @@ def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "fails.Fails-replay.parquet", "fails.Fails-constant_velocity.parquet"
     }  # fmt: skip
-    # 3. another planner under the same name, once it is the one that drives, and a damaged file
+    # 3. another planner under the same name, once it is the one that drives, and a file that is not ours to replace
     (tmp_path / "fails.py").write_text(FAILING_PLANNER + "# changed\n")
     assert driven_by(config) == []
     del sys.modules["fails"]
@@ -284,6 +284,9 @@ def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path
     assert "is of another planner_code: it will be replaced" in caplog.text
     damaged = tmp_path / "out" / "fails.Fails-replay.parquet"
     damaged.write_bytes(damaged.read_bytes()[:100])
+    with pytest.raises(DataError, match=r"replay\.parquet is in the way \(cannot be read .*\): choose another --out"):
+        driven_by(config)
+    damaged.unlink()
     assert driven_by(config) == list(ids)
 
 
@@ -457,7 +460,7 @@ def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
         with pytest.raises(DataError, match="drive both alike"):
             compare_drives(result, other)
     models = [replace(result, settings=replace(result.settings, model=model)) for model in ("none", "first", "second")]
-    titles = [str(format_drive_comparison(models[a], models[b], alpha=0.05).title) for a, b in ((0, 1), (1, 2))]
+    titles = [str(format_drive_comparison(compare_drives(models[a], models[b])).title) for a, b in ((0, 1), (1, 2))]
     assert ["models differ" in title for title in titles] == [False, True]
     with pytest.raises(DataError, match="no such result"):
         DriveResult.read(tmp_path / "none.parquet")
@@ -499,6 +502,10 @@ EDITS = {
     "a seed in letters": (lambda table: with_settings(table, seed="one"), "seed must be a whole number, got 'one'"),
     "no column of ids": (lambda table: table.drop_columns(["scenario_id"]), "it lacks column scenario_id"),
     "no column of a score": (lambda table: table.drop_columns(["comfort"]), "it lacks column comfort"),
+    "a score that is no score": (
+        lambda table: table.set_column(2, "nuplan_style", pa.array([1e200])),
+        "column nuplan_style has a number beyond 1e+07",
+    ),
     "a score in letters": (
         lambda table: table.set_column(2, "nuplan_style", pa.array(["high"])),
         "column nuplan_style has empty cells or those of another type",

@@ -48,9 +48,10 @@ def pushed(scenario, speed=10.0, steps=80, **settings):
     return env
 
 
+@pytest.mark.parametrize("height_m", [6.0, 1.9])  # cars are 1.6 m high
 @pytest.mark.parametrize(("road", "up"), [(ROAD, (0,)), (CROSSING, (1,))])
-def test_a_parked_car_under_or_over_the_road_is_not_met(road, up):
-    result = driven("replay", bridge(EGO, BELOW, road=road, up=up))
+def test_a_parked_car_under_or_over_the_road_is_not_met(road, up, height_m):
+    result = driven("replay", bridge(EGO, BELOW, road=road, up=up, height_m=height_m))
     assert result.record.collisions == ()
     assert (result.planner.time_to_collision, result.planner.least_ttc_s) == (1.0, 3.0)
     assert result.planner.nuplan_style > 0.8

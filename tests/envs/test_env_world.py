@@ -1,5 +1,6 @@
 """The loop of a planner and the traffic model: the same dice as `simulate`, forks, snapshots, the log itself."""
 
+import hashlib
 import subprocess
 import sys
 from dataclasses import replace
@@ -186,6 +187,12 @@ def test_snapshots_of_something_else_are_refused(data):
         damaged = saved[:place] + bytes([saved[place] ^ 1]) + saved[place + 1 :]
         with pytest.raises(DataError, match="not a snapshot of an episode, or a damaged one"):
             env.restore(damaged)
+    body = saved[:-32]
+    for dice in (b'{"seed": -1,', b'{"seed":"0",', b'{"seed":[0],'):
+        damaged = body.replace(b'{"seed": 0, ', dice)
+        assert damaged != body
+        with pytest.raises(DataError, match="damaged snapshot"):
+            env.restore(damaged + hashlib.sha256(damaged).digest())
     env.restore(saved)
 
 

@@ -160,11 +160,11 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeyp
     whole = evaluate(Wobble(), data, tmp_path, CONFIG, name="whole")
     original, seen = module._evaluate_scenario, []
 
-    def interrupt_at_the_sixth(job, position):
+    def interrupt_at_the_sixth(*work):
         if len(seen) == 5:
             raise KeyboardInterrupt
-        seen.append(position)
-        return original(job, position)
+        seen.append(work[-1])
+        return original(*work)
 
     monkeypatch.setattr(module, "_evaluate_scenario", interrupt_at_the_sixth)
     with pytest.raises(KeyboardInterrupt):
@@ -172,9 +172,12 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeyp
     assert not (tmp_path / "cut.parquet").exists()
     assert len(list((tmp_path / "cut.parts").glob("*.parquet"))) == 1
     rest = []
-    monkeypatch.setattr(
-        module, "_evaluate_scenario", lambda job, p: rest.append(job.dataset.scenario_ids[p]) or original(job, p)
-    )
+
+    def note(policy, dataset, config, position):
+        rest.append(dataset.scenario_ids[position])
+        return original(policy, dataset, config, position)
+
+    monkeypatch.setattr(module, "_evaluate_scenario", note)
     assert same(evaluate(Wobble(), data, tmp_path, CONFIG, name="cut"), whole)
     assert rest == ["gaps", "again", "crowd"]
     assert not (tmp_path / "cut.parts").exists()

@@ -130,7 +130,11 @@ def test_pages_by_shares_and_after_an_interruption_are_the_same(scenario, tmp_pa
     assert main([*words("shared"), "--jobs", "1", "--share", "1/2"]) == 0
     assert "explain: share 1/2 is done; 1 of 3 pieces are left" in capsys.readouterr().err
     assert not (tmp_path / "shared" / "pages" / "junction.html").exists()
+    [page] = (tmp_path / "shared" / "pages").rglob("junction.html")
+    page.write_bytes(page.read_bytes()[:-1000])
     assert main([*words("shared"), "--jobs", "1", "--share", "2/2"]) == 0
+    assert "junction.html has to be made again: its end is missing" in capsys.readouterr().err
+    assert main([*words("shared"), "--jobs", "1", "--share", "1/2"]) == 0
     assert files("shared") == files("whole")
     # the second page fails; the first is not made again
     explained, original = [], explain_page.explain

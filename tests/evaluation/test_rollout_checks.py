@@ -61,6 +61,12 @@ def test_another_frame_is_told_by_scenario_agent_and_distance(warnings_of):
     assert "this one 6000 m from there in rollout 0." in line
 
 
+@pytest.mark.filterwarnings("error")
+def test_positions_whose_squares_no_number_holds_are_far(warnings_of):
+    states = logged_states(SCENARIO, num_rollouts=1)
+    assert "agents do not begin where the log stops" in warnings_of(replace(states, x=states.x + 3e38))[0]
+
+
 @pytest.mark.parametrize(
     ("axis", "change", "text"),
     [

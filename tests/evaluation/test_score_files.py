@@ -82,19 +82,22 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, rollouts, tmp_pat
     whole = score_rollouts(rollouts, data, None, CONFIG)
     original, seen = module._score_entry, []
 
-    def interrupt_at_the_sixth(job, position):
+    def interrupt_at_the_sixth(*work):
         if len(seen) == 5:
             raise KeyboardInterrupt
-        seen.append(position)
-        return original(job, position)
+        seen.append(work[-1])
+        return original(*work)
 
     monkeypatch.setattr(module, "_score_entry", interrupt_at_the_sixth)
     with pytest.raises(KeyboardInterrupt):
         score_rollouts(rollouts, data, tmp_path, CONFIG)
     rest = []
-    monkeypatch.setattr(
-        module, "_score_entry", lambda job, p: rest.append(job.entries[p].scenario_id) or original(job, p)
-    )
+
+    def note(entries, *work):
+        rest.append(entries[work[-1]].scenario_id)
+        return original(entries, *work)
+
+    monkeypatch.setattr(module, "_score_entry", note)
     assert same(score_rollouts(rollouts, data, tmp_path, CONFIG), whole)
     assert rest == ["again", "crowd"]
     rest.clear()

@@ -9,7 +9,6 @@ import pytest
 
 import scenes
 from made_up import evaluation
-from rlftsim.cli.exam import parse_rows
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig
@@ -20,6 +19,7 @@ from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import sumo
 from rlftsim.statistics import mean_interval
+from rlftsim.verbs.exam import parse_rows
 
 NETWORKS = [f"network{k // 4}" for k in range(80)]
 """Eighty scenarios of twenty street networks."""

@@ -13,7 +13,7 @@ from rlftsim.goals.maneuvers.logged import logged_maneuver
 from rlftsim.goals.maneuvers.proposals import CurrentAgent, no_proposal_reason, propose_from_lanes
 from rlftsim.goals.maneuvers.reach import compute_reach
 from rlftsim.scenario.lane_graph import lane_graph
-from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
+from rlftsim.scenario.maneuver import Maneuver, classify_turn
 from rlftsim.scenario.types import MapFeatures, ObjectType
 
 
@@ -195,7 +195,7 @@ def test_a_curve_that_is_taken_too_fast_is_the_end():
     [(0, "straight"), (29, "straight"), (31, "left"), (-31, "right"), (134, "left"), (136, "left_uturn"), (-150, None)],
 )
 def test_paths_are_named_by_their_turn(degrees, name):
-    assert maneuver_of_turn(np.radians(degrees)) == name
+    assert classify_turn(np.radians(degrees)) == name
 
 
 # ---- the log -------------------------------------------------------------------------------------

@@ -1,4 +1,6 @@
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pyarrow as pa
@@ -17,8 +19,8 @@ def damaged_text():
     return pa.Array.from_buffers(pa.string(), 1, pa.array([b"\xff\xfe"], pa.binary()).buffers())
 
 
-def write_arrow(path, table):
-    with pa.ipc.new_file(path, table.schema) as writer:
+def write_arrow(path, table, compression=None):
+    with pa.ipc.new_file(path, table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
         writer.write_table(table)
     return path
 
@@ -32,10 +34,56 @@ def test_text_that_is_no_utf8_is_refused_in_both_formats(tmp_path):
         map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
 
 
+READ_DAMAGED = """
+import sys
+from pathlib import Path
+from rlftsim.errors import DataError
+from rlftsim.jobs.tables import read_parquet
+
+whole, damaged = Path(sys.argv[1]).read_bytes(), Path(sys.argv[2])
+for position in range(4, len(whole)):
+    damaged.write_bytes(whole[:position] + bytes([whole[position] ^ 0x13]) + whole[position + 1 :])
+    try:
+        read_parquet(damaged, "write it again")
+    except DataError:
+        pass
+"""
+
+
+def test_no_damaged_byte_of_a_parquet_file_ends_the_process(tmp_path):
+    pq.write_table(pa.table({"a": ["x", "y"], "b": ["z", "z"], "c": [1, 2]}), tmp_path / "a.parquet")
+    command = [sys.executable, "-c", READ_DAMAGED, str(tmp_path / "a.parquet"), str(tmp_path / "damaged.parquet")]
+    subprocess.run(command, check=True)
+
+
 def test_a_column_twice_is_refused(tmp_path):
     table = pa.table([pa.array([1]), pa.array([2])], names=["a", "a"])
     with pytest.raises(DataError, match="two columns 'a'"):
         map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_compressed_shard_is_refused_before_it_fills_the_memory(compression, tmp_path):
+    table = pa.table({"a": [bytes(1 << 20)] * 16})
+    path, unused = write_arrow(tmp_path / "a.arrow", table, compression), pa.default_memory_pool().max_memory()
+    assert path.stat().st_size < 1 << 17
+    del table
+    with pytest.raises(DataError, match=r"is damaged \(it is compressed, .*\): convert again\.$"):
+        map_arrow(path, "convert again")
+    assert pa.default_memory_pool().max_memory() == unused
+
+
+def test_a_shard_is_mapped_and_its_batches_are_as_many_as_its_end_says(tmp_path):
+    batches = pa.table({"a": pa.chunked_array([[bytes(1 << 16)], [b"x", None], []], pa.binary()), "b": [1, 2, 3]})
+    before = pa.total_allocated_bytes()
+    table = map_arrow(write_arrow(tmp_path / "a.arrow", batches), "convert again")
+    assert table.equals(batches)
+    assert pa.total_allocated_bytes() - before < 1 << 12
+    data = (tmp_path / "a.arrow").read_bytes()
+    for size in (8, 200, len(data) // 2, len(data) - 20):
+        (tmp_path / "cut.arrow").write_bytes(data[:size])
+        with pytest.raises(DataError, match="is damaged"):
+            map_arrow(tmp_path / "cut.arrow", "convert again")
 
 
 def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ import pytest
 
 import rlftsim
 from rlftsim.cli import main
-from rlftsim.cli.plugins import Plugins
 from rlftsim.jobs.interruption import SIGNALS, Interruption, ctrl_c_waits, signals_like_ctrl_c
 
 
@@ -29,7 +28,7 @@ def _handlers_of_a_new_process():
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGUSR1, 138)])
 def test_a_signal_ends_a_command_in_one_line_with_its_status(number, status, monkeypatch, capsys):
     handlers = [signal.getsignal(one) for one in SIGNALS]
-    monkeypatch.setattr(Plugins, "run", lambda _: signal.raise_signal(number))
+    monkeypatch.setattr("rlftsim.verbs.plugins.plugins", lambda: signal.raise_signal(number))
     assert main(["plugins"]) == status
     assert capsys.readouterr().err == "\nrlftsim: stopped. The same command starts anew.\n"
     assert [signal.getsignal(one) for one in SIGNALS] == handlers

@@ -166,7 +166,7 @@ def test_one_module_imports_ray_and_no_command_does_without_being_asked():
         or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "ray")
     }
     assert importing == {"jobs/ray.py"}
-    script = "import sys, rlftsim.cli.results, rlftsim.cli.data, rlftsim.cli.submit; print('ray' in sys.modules)"
+    script = "import sys, rlftsim.verbs.evaluate, rlftsim.verbs.data, rlftsim.verbs.submit; print('ray' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
     assert done.stdout == "False\n", done.stderr

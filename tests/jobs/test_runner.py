@@ -15,7 +15,7 @@ import pytest
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.processes import Processes, SetAside, log_item
-from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work, check_finished, choose_runner
+from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work, check_finished, choose_runner, select_items
 
 SCRIPT = """
 import rlftsim.jobs.runner
@@ -143,9 +143,11 @@ def test_a_task_that_cannot_be_pickled_is_refused():
 def test_shares_have_every_item_once(of):
     items = list(range(14))
     shares = [Share.parse(f"{k}/{of}", Inline()) for k in range(1, of + 1)]
-    assert sorted(item for share in shares for item in share.select(items)) == items
-    assert max(len(share.select(items)) for share in shares) - min(len(share.select(items)) for share in shares) <= 1
-    assert Share.parse("join", Inline()).select(items) == []
+    selected = [select_items(share, items) for share in shares]
+    assert sorted(item for share in selected for item in share) == items
+    assert max(map(len, selected)) - min(map(len, selected)) <= 1
+    assert select_items(Share.parse("join", Inline()), items) == []
+    assert select_items(Processes(2), items) == items
 
 
 @pytest.mark.parametrize("text", ["3", "0/4", "5/4", "a/4", "1/0", "-1/4", "1.5/4", "/", ""])

@@ -12,7 +12,7 @@ import pytest
 import scenes
 from rlftsim.errors import DataError
 from rlftsim.rollout.edge_scenes import move_scenario
-from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, read_manifest, write_dataset
+from rlftsim.scenario.dataset import ScenarioDataset, read_manifest, write_dataset
 from rlftsim.scenario.types import LaneTopology
 from rlftsim.scenario.womd import read_scenarios, scenario_from_bytes
 
@@ -93,9 +93,7 @@ def test_the_same_object_comes_back_while_it_is_cached(folder):
 
 
 def test_many_scenarios_are_spread_over_shards(tmp_path, scenarios):
-    with DatasetWriter(tmp_path / "data", scenarios_per_shard=2) as writer:
-        for scenario in scenarios:
-            writer.add(scenario)
+    write_dataset(iter(scenarios), tmp_path / "data", scenarios_per_shard=2)
     dataset = ScenarioDataset(tmp_path / "data")
     assert [entry.num_rows for entry in dataset.manifest.shards] == [2, 2, 1]
     assert [scenario.scenario_id for scenario in dataset] == dataset.scenario_ids == ["id0", "id1", "id2", "id3", "id4"]
@@ -119,9 +117,12 @@ def test_the_same_scenarios_give_the_same_bytes(tmp_path, scenarios):
 def test_the_fingerprint_is_that_of_the_content_of_a_split(tmp_path, scenarios):
     moved = [*scenarios[:3], move_scenario(scenarios[3], 0.0, (0.0, 0.5))]
     for name, some in {"first": scenarios[:4], "elsewhere": scenarios[:4], "grown": scenarios, "moved": moved}.items():
-        with DatasetWriter(tmp_path / name, scenarios_per_shard=4) as writer:
-            for scenario in some:
-                writer.add(scenario, "validation" if scenario.scenario_id == "id4" else "training")
+        write_dataset(
+            some,
+            tmp_path / name,
+            split=lambda s: "validation" if s.scenario_id == "id4" else "training",
+            scenarios_per_shard=4,
+        )
     found = {name: ScenarioDataset(tmp_path / name, "training") for name in ("first", "elsewhere", "grown", "moved")}
     first, elsewhere, grown, other = (one.fingerprint for one in found.values())
     assert first == elsewhere == grown  # of another split no file has a part in it

@@ -10,13 +10,12 @@ from rlftsim.errors import DataError
 from rlftsim.scenario import dataset
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import (
-    DatasetWriter,
     build_index,
     read_manifest,
     write_dataset,
     write_index_and_manifest,
 )
-from rlftsim.scenario.inspect import Problem, check_scenario, dataset_stats, verify_dataset
+from rlftsim.scenario.inspect import Problem, dataset_stats, find_problems, verify_dataset
 from rlftsim.scenario.source import CONTRADICTORY
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
@@ -35,7 +34,7 @@ def make_dataset(tmp_path):
 
 
 def found(folder):
-    return [(finding.problem, finding.where) for finding in verify_dataset(folder)]
+    return [(finding.problem, finding.location) for finding in verify_dataset(folder)]
 
 
 def test_nothing_is_found_in_a_sound_data_set(make_dataset, make_message):
@@ -130,11 +129,11 @@ def test_a_map_in_another_frame_and_positions_beyond_float32_are_found(
         state.center_y += 5_000.0
     folder = make_dataset(shifted, make_message("b"))
     (finding,) = verify_dataset(folder)
-    assert (finding.problem, finding.where) == (Problem.MAP_ELSEWHERE, "a")
+    assert (finding.problem, finding.location) == (Problem.MAP_ELSEWHERE, "a")
     assert " m from the ego: give map and tracks the same origin" in finding.detail
     unknown = scenario_from_bytes(shifted.SerializeToString())  # the ego may be anywhere: nothing is known to be far
     unknown.tracks.valid[unknown.ego_index, 10] = False
-    assert Problem.MAP_ELSEWHERE not in [finding.problem for finding in check_scenario(unknown)]
+    assert Problem.MAP_ELSEWHERE not in [finding.problem for finding in find_problems(unknown)]
 
     scenario = scenario_from_bytes(make_message("utm").SerializeToString())
     scenario.tracks.position[..., 1] += 4_649_000.0
@@ -162,7 +161,7 @@ def test_missing_map_and_no_agent_to_evaluate_are_found(make_dataset, make_messa
     # other sources may have an ego that is not valid either
     whole = scenario_from_bytes(make_message("d").SerializeToString())
     empty = replace(whole, tracks=replace(whole.tracks, valid=np.zeros_like(whole.tracks.valid)))
-    (finding,) = check_scenario(empty)
+    (finding,) = find_problems(empty)
     assert finding.detail == only_ego.replace("only the ego is evaluated", "nor is the ego: nothing is evaluated")
 
 
@@ -234,7 +233,14 @@ def test_stats_count_and_measure(make_dataset, make_message):
 
 
 def test_stats_of_an_empty_data_set_are_zeros(tmp_path):
-    with DatasetWriter(tmp_path / "empty"):  # as a conversion writes it that loses every record
-        pass
+    (tmp_path / "empty").mkdir()
+    write_index_and_manifest(tmp_path / "empty", [])  # as a conversion writes it that loses every record
     stats = dataset_stats(tmp_path / "empty")
     assert (stats.num_scenarios, stats.mean_agents, stats.speeds) == (0, 0.0, {})
+
+
+def test_timestamps_that_are_no_list_are_named(make_message):
+    scenario = scenario_from_bytes(make_message("a").SerializeToString())
+    object.__setattr__(scenario, "timestamps_s", None)  # as a damaged shard has them
+    with pytest.raises(DataError, match="timestamps are None, not one number for each step"):
+        scenario.check_consistency()

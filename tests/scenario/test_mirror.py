@@ -8,7 +8,7 @@ import pytest
 import scenes
 from rlftsim.realism import scenario_log
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.mirror import mirrored
+from rlftsim.scenario.mirror import mirror_scenario
 from rlftsim.scenario.synthetic import pack_path
 
 
@@ -26,11 +26,11 @@ def assert_equal(one, other):
 
 
 def test_a_mirror_twice_is_none(scenario):
-    assert_equal(mirrored(mirrored(scenario)), scenario)
+    assert_equal(mirror_scenario(mirror_scenario(scenario)), scenario)
 
 
 def test_the_metric_measures_the_same_but_for_the_sign_of_turns(scenario):
-    ours, seen = scenario_log(scenario).features, scenario_log(mirrored(scenario)).features
+    ours, seen = scenario_log(scenario).features, scenario_log(mirror_scenario(scenario)).features
     signs = {"angular_speed": -1, "angular_acceleration": -1}
     for field in fields(ours):
         value, other = getattr(ours, field.name), getattr(seen, field.name)
@@ -40,7 +40,7 @@ def test_the_metric_measures_the_same_but_for_the_sign_of_turns(scenario):
 
 
 def test_left_turns_become_right_turns_and_left_neighbors_right_ones(scenario):
-    seen = mirrored(scenario)
+    seen = mirror_scenario(scenario)
     assert np.array_equal(seen.tracks.heading, -scenario.tracks.heading)
     for name in ("neighbors", "boundaries"):
         ours, theirs = (getattr(one.map_features.topology, name) for one in (scenario, seen))

@@ -13,8 +13,8 @@ from typing import get_type_hints
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim.cli.main import HAVE_SHARES, VERBS, main
-from rlftsim.cli.submit import Build
+from rlftsim.cli.main import HAVE_SHARES, main
+from rlftsim.cli.parse import OLD_COMMANDS
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.jobs import folder as folders
@@ -23,6 +23,7 @@ from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.verbs.commands import COMMANDS, read_arguments
 
 CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 
@@ -111,6 +112,22 @@ def test_simulations_and_augmented_goals_are_the_same_by_processes_and_by_shares
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "shares").glob("*[0-9a-f].*")}
     assert run("shares") == 0  # nothing is done twice
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
+
+
+@pytest.mark.parametrize("verb", ["simulate", "augment"])
+def test_a_file_that_was_cut_off_is_made_again_and_not_joined(verb, augment, tmp_path, capsys):
+    words = [*{"simulate": SIMULATE, "augment": augment}[verb], "--out", str(tmp_path / "out")]
+    assert main(words) == 0
+    before = contents(tmp_path / "out")
+    cut = sorted(path for path in (tmp_path / "out").iterdir() if path.suffix in (".npz", ".parquet"))[1]
+    cut.write_bytes(cut.read_bytes()[:-1000])
+    capsys.readouterr()
+    assert main(["join", *words]) == 1
+    err = capsys.readouterr().err
+    assert err.count(f"{cut} has to be made again: cannot be read") == 1
+    assert f"{verb}: 1 of" in err
+    assert main(words) == 0
+    assert contents(tmp_path / "out") == before
 
 
 @pytest.mark.parametrize("verb", ["simulate", "augment"])
@@ -235,11 +252,13 @@ def test_a_share_takes_over_from_a_driver_that_was_stopped(tmp_path):
 
 
 def test_the_commands_that_join_takes_are_those_with_shares():
-    classes = {verb: getattr(importlib.import_module(module), name) for verb, (module, name) in VERBS.items()}
-    classes["submit build"] = Build
-    with_shares = {
-        verb for verb, cls in classes.items() if any(hint in (Machines, Work) for hint in get_type_hints(cls).values())
+    old = {name: place.split(":") for name, place in OLD_COMMANDS.items()}
+    annotations = {
+        name: get_type_hints(getattr(importlib.import_module(m), c)).values() for name, (m, c) in old.items()
     }
+    for name, command in COMMANDS.items():
+        annotations[name] = [argument.annotation for argument in read_arguments(command.function).values()]
+    with_shares = {name for name, kinds in annotations.items() if any(kind in (Machines, Work) for kind in kinds)}
     assert with_shares == set(HAVE_SHARES)
 
 
@@ -257,6 +276,26 @@ def test_a_lock_that_a_clock_or_disk_has_spoiled_is_refused_in_one_line(tmp_path
         (tmp_path / "lock").write_bytes(text)
         with pytest.raises(NotYetError, match=rf"works in {tmp_path}{whom}: wait for it"):
             Lease(tmp_path / "lock", Inline(), "works in")
+
+
+@pytest.mark.parametrize("runner", [Inline(), Share(1, 2, Inline())])
+@pytest.mark.parametrize("text", [b"of the user\n", b"\xff\xfe", b"\nlocal notes since 2020-01-01T00:00:00\n"])
+def test_a_file_of_the_user_with_the_name_of_the_lock_stays(text, runner, tmp_path):
+    lock = tmp_path / ".lock"
+    lock.write_bytes(text)
+    with pytest.raises(DataError, match=r"\.lock is no lock of `rlftsim`: rename it, or choose another folder\.$"):
+        Lease(lock, runner, "works in")
+    folders.remove_locks(lock)
+    assert lock.read_bytes() == text
+
+
+@pytest.mark.parametrize("text", ["", "\n", "\nold process 12 since 2026-01-01T00:00:00+00:00\n0\n"])
+def test_a_lock_that_a_stopped_process_left_is_taken(text, tmp_path):
+    (tmp_path / ".lock").write_text(text)
+    with Lease(tmp_path / ".lock", Inline(), "works in") as lease:
+        assert f"process {os.getpid()}" in (tmp_path / ".lock").read_text()
+        lease.remove()
+    assert not (tmp_path / ".lock").exists()
 
 
 def test_a_share_that_ends_when_all_is_put_together_brings_nothing_back(tmp_path):

@@ -240,7 +240,12 @@ def spoil_tracks(m):
     m.ClearField("tracks")
 
 
+def spoil_lane_far_out(m):
+    m.map_features[0].lane.polyline[0].x = 1e30
+
+
 BAD = [
+    (spoil_lane_far_out, r"map point 0 is at \(1e\+30, "),
     (spoil_nan, "track 101 has a NaN or infinite position at step 17"),
     (spoil_infinite, "track 101 has a NaN or infinite position at step 17"),
     (spoil_heading, "track 101 has a NaN or infinite heading at step 17"),

@@ -25,7 +25,7 @@ from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.submission.build import build_archive, delete_parts, forecast_size
+from rlftsim.submission.build import build_archive, delete_shards, forecast_size
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import check_closed_loop, statement
 from rlftsim.submission.messages import round_states
@@ -46,7 +46,7 @@ def whole(data, tmp_path_factory):
 
 
 def build(data, folder, **settings):
-    more = {name: settings.pop(name) for name in ("delete_parts", "runner") if name in settings}
+    more = {name: settings.pop(name) for name in ("is_deleting", "runner") if name in settings}
     job = entries.make_job(data, folder, **{"num_shards": NUM_SHARDS, **settings})
     return build_archive(job, show_progress=False, **more)
 
@@ -98,7 +98,7 @@ def test_a_killed_build_goes_on_to_the_same_bytes(data, whole, tmp_path):
     for number in range(5):
         folder = tmp_path / f"killed-{number}"
         process = multiprocessing.get_context("fork").Process(
-            target=build, args=(data, folder), kwargs={"delete_parts": number % 2 == 1}
+            target=build, args=(data, folder), kwargs={"is_deleting": number % 2 == 1}
         )
         process.start()
         time.sleep(moments.uniform(0.05, seconds))
@@ -170,7 +170,7 @@ def test_ctrl_c_leaves_a_folder_that_goes_on(data, whole, tmp_path, monkeypatch)
 
 
 def test_parts_go_as_they_are_joined(data, whole, tmp_path):
-    assert build(data, tmp_path, delete_parts=True).read_bytes() == whole
+    assert build(data, tmp_path, is_deleting=True).read_bytes() == whole
     assert not list((tmp_path / "shards").glob("*.part"))
 
 
@@ -179,8 +179,8 @@ def test_only_the_files_of_the_build_are_removed(data, tmp_path):
     mine = [tmp_path / "shards" / name for name in ("validation.arrow", ".hidden")]
     for path in mine:
         path.write_text("of a user")
-    build(data, tmp_path, delete_parts=True)
-    delete_parts(entries.make_job(data, tmp_path, num_shards=NUM_SHARDS))
+    build(data, tmp_path, is_deleting=True)
+    delete_shards(entries.make_job(data, tmp_path, num_shards=NUM_SHARDS))
     assert sorted((tmp_path / "shards").iterdir()) == sorted(mine)
 
 
@@ -189,7 +189,7 @@ def test_a_receipt_of_another_file_counts_for_nothing(data, tmp_path):
     (tmp_path / "mine.txt").write_text("of a user")
     receipt = {"file": "../mine.txt", "size": 9, "piece_crc": 0, "raw_size": 9, "raw_crc": 0}
     (tmp_path / "shards" / "00000.json").write_text(json.dumps(receipt))
-    build(data, tmp_path, delete_parts=True)
+    build(data, tmp_path, is_deleting=True)
     assert (tmp_path / "mine.txt").read_text() == "of a user"
 
 

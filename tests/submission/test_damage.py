@@ -200,7 +200,7 @@ def test_a_damage_is_found_as_what_it_is(case, shards, data, tmp_path):
     damage(shards)
     found = check_archive(entries.pack(tmp_path / "a.tar.gz", shards), data, show_progress=False).findings
     assert set(found.counts) == {number}
-    first = found.kept[0]
+    first = found.stored[0]
     assert (first.severity, first.file, first.scenario_id, first.object_id) == (severity, file, scenario, object_id)
     assert re.search(text, first.text)
     assert found.has_errors == (severity == "error")
@@ -228,7 +228,7 @@ def test_a_file_that_python_cannot_read_to_its_end_is_check_7(write, text, good,
     write(tmp_path / "a.tar.gz", good)
     found = check_archive(tmp_path / "a.tar.gz", data, show_progress=False).findings
     assert set(found.counts) == {7}
-    assert re.search(text, found.kept[0].text)
+    assert re.search(text, found.stored[0].text)
 
 
 def test_sizes_are_check_16(good, data, tmp_path, monkeypatch):
@@ -237,7 +237,7 @@ def test_sizes_are_check_16(good, data, tmp_path, monkeypatch):
     monkeypatch.setattr(check, "DOUBTFUL_ARCHIVE_BYTES", archive.stat().st_size)
     found = check_archive(archive, data, show_progress=False).findings
     assert set(found.counts) == {16}
-    assert {finding.severity for finding in found.kept} == {"error", "warning"}
+    assert {finding.severity for finding in found.stored} == {"error", "warning"}
 
 
 def test_another_file_than_the_reported_one_is_check_17(good, data, tmp_path):
@@ -249,7 +249,7 @@ def test_another_file_than_the_reported_one_is_check_17(good, data, tmp_path):
     assert set(found.counts) == {17}
     part = tmp_path / "a.tar.gz.000"
     part.write_bytes(whole)
-    (finding,) = check_archive(part, data, show_progress=False).findings.kept
+    (finding,) = check_archive(part, data, show_progress=False).findings.stored
     assert finding.check == 17
     assert "cat a.tar.gz.??? > a.tar.gz" in finding.text
 

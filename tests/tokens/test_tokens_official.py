@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.womd import read_scenario_file
+from rlftsim.scenario.womd import read_scenarios
 from rlftsim.tokens.agent_tokens import clean_tracks, tokenize_agents
 from rlftsim.tokens.map_tokens import split_map, tokenize_map
 from rlftsim.tokens.vocabulary import Vocabulary
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.official
 
 @pytest.fixture(scope="module")
 def batch(shared):
-    [(_, scenario)] = read_scenario_file(shared / "data" / "womd" / "motion_data_one_scenario.tfrecord")
+    [scenario] = read_scenarios(shared / "data" / "womd" / "motion_data_one_scenario.tfrecord")
     return collate([scenario])
 
 

@@ -17,32 +17,11 @@ from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 
-VERBS = {
-    "demo": ("rlftsim.cli.demo", "Demo"),
-    "doctor": ("rlftsim.cli.doctor", "Doctor"),
-    "plugins": ("rlftsim.cli.plugins", "Plugins"),
-    "convert": ("rlftsim.cli.data", "Convert"),
-    "data": ("rlftsim.cli.data", "Data"),
-    "synthesize": ("rlftsim.cli.data", "Synthesize"),
-    "recipe": ("rlftsim.cli.recipe", "PrintRecipe"),
-    "tokens": ("rlftsim.cli.tokens", "Tokens"),
-    "pretrain": ("rlftsim.cli.train", "Pretrain"),
-    "finetune": ("rlftsim.cli.train", "Finetune"),
-    "augment": ("rlftsim.cli.augment", "Augment"),
-    "model": ("rlftsim.cli.model", "Model"),
-    "goals": ("rlftsim.cli.goals", "GoalsVerb"),
-    "simulate": ("rlftsim.cli.simulate", "Simulate"),
-    "drive": ("rlftsim.cli.drive", "Drive"),
-    "studio": ("rlftsim.cli.studio", "StudioVerb"),
-    "score": ("rlftsim.cli.results", "Score"),
-    "evaluate": ("rlftsim.cli.results", "Evaluate"),
-    "compare": ("rlftsim.cli.results", "Compare"),
-    "submit": ("rlftsim.cli.submit", "Submit"),
-    "experiment": ("rlftsim.cli.experiment", "RunExperiment"),
-}
-"""Module and class of each verb, in the order in which a newcomer needs them."""
-EXAM = {"experiment exam": ("rlftsim.cli.exam", "Exam")}
-"""An experiment that trains nothing, so it has flags of its own."""
+VERBS = (
+    "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "augment",
+    "model", "goals", "simulate", "drive", "studio", "score", "evaluate", "compare", "submit", "experiment",
+)  # fmt: skip
+"""Verbs in the order in which a newcomer needs them."""
 
 OVERVIEW = f"""rlftsim {__version__}: traffic agents that behave like real road users.
 
@@ -146,20 +125,23 @@ def parse(words: Sequence[str]) -> Any:
         ConfigError: the words make no sense.
         SystemExit: they ask for help, which has been printed.
     """
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:  # bytes that are no text, as Python keeps them; tables and messages take none
+            raise ConfigError(f"{in_short(word)} is no text in UTF-8: rename the file or folder.") from None
     # Imported late: the overview is printed without it.
     from rlftsim.cli.parse import parse as parse_words
 
-    if " ".join(words[:2]) in EXAM:
-        return parse_words([" ".join(words[:2]), *words[2:]], EXAM)
     if words[0] != JOIN:
-        return parse_words(words, VERBS)
+        return parse_words(words)
     command = words[1:]
     if "--share" in command or not any(" ".join(command[:length]) in HAVE_SHARES for length in (1, 2)):
         raise ConfigError(
             f"{' '.join(words[:3])}: write the command of a share behind {JOIN}, without --share; commands with shares "
             f"are {', '.join(HAVE_SHARES)}."
         )
-    return parse_words([*command, "--share", JOIN], VERBS)
+    return parse_words([*command, "--share", JOIN])
 
 
 def _in_words(error: Exception) -> str | None:

@@ -15,6 +15,20 @@ def flags_of(words: Sequence[str]) -> list[str]:
     return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
 
 
+def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
+    """One line that says which action is missing or unknown.
+
+    Args:
+        words: Words behind the verb.
+        actions: Actions of the verb.
+    """
+    if not words or words[0].startswith("-"):
+        return f"missing: one of {','.join(actions)}."
+    near = difflib.get_close_matches(words[0], actions, 1)
+    hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(actions)}."
+    return f"no action {words[0]}: {hint}"
+
+
 def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     """One line that says what is wrong with a command line.
 
@@ -25,9 +39,7 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     """
     actions = ACTIONS.search(help_text)
     if actions and words and not words[0].startswith("-"):
-        near = difflib.get_close_matches(words[0], actions[1].split(","), 1)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(actions[1].split(','))}."
-        return f"no action {words[0]}: {hint}"
+        return explain_action(words, actions[1].split(","))
     known = list(dict.fromkeys(FLAG.findall(help_text)))
     for flag in flags_of(words):
         if flag not in known:

@@ -5,69 +5,106 @@ import io
 import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+import textwrap
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from rlftsim.cli.mistakes import FLAG, explain, flags_of
+import tyro
+
+from rlftsim.cli.mistakes import FLAG, explain, explain_action, flags_of
 from rlftsim.cli.stand_ins import stand_ins
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
+from rlftsim.verbs.commands import ACTIONS, COMMANDS, Command, dataclass_parser, describe
 
+OLD_COMMANDS = {
+    "tokens": "rlftsim.cli.tokens:Tokens",
+    "pretrain": "rlftsim.cli.train:Pretrain",
+    "finetune": "rlftsim.cli.train:Finetune",
+    "experiment": "rlftsim.cli.experiment:RunExperiment",
+}
+"""Module and class of each verb that is no function yet."""
 HELP = ("-h", "--help")
 COUNTS = (
     "jobs", "processes", "num_rollouts", "num_scenarios", "limit", "seeds", "top_k", "nodes", "cores", "measure"
 )  # fmt: skip
-"""Fields of verbs that are 1 or more."""
+"""Arguments of verbs that are 1 or more."""
 EITHER_OR = {"--goal-logit-bias": "True", "--no-goal-logit-bias": "False"}
 """Switches that may also be left out, which is a third value. tyro has no such kind: it is handed the value."""
 ADDRESS = re.compile(r"\w{2,}:/")
 """Beginning of an address such as s3://bucket, of which a path keeps one slash."""
 
 
-def parse(words: Sequence[str], verbs: Mapping[str, tuple[str, str]]) -> Any:
+def parse(words: Sequence[str]) -> Any:
     """The verb of a command line with its settings; has a method `run`.
 
     Args:
-        words: the verb and what follows it.
-        verbs: name -> module and class.
+        words: Verb, its action if it has some, and what follows.
 
     Raises:
-        ConfigError: the words make no sense; says which word and what it may have meant.
-        SystemExit: they ask for help, which has been printed.
+        ConfigError: The words make no sense; says which word and what it may have meant.
+        SystemExit: They ask for help, which has been printed.
     """
-    name, *rest = words
     # switches that may be left out get the value that tyro expects
-    rest = [part for word in rest for part in (["--goal-logit-bias", EITHER_OR[word]] if word in EITHER_OR else [word])]
+    words = [
+        part for word in words for part in (["--goal-logit-bias", EITHER_OR[word]] if word in EITHER_OR else [word])
+    ]
     # help leaves here by SystemExit
-    if any(word in HELP for word in rest):
+    if any(word in HELP for word in words):
         try:
             with stand_ins():
-                _parsed(name, rest, verbs)
+                _parse_verb(words)
         # A package that computes with torch, when it is imported or in a recipe, fails with stand-ins in ways of
         # its own. Then help waits for the real libraries, and so does the message of a real mistake.
         except Exception as error:
             log.debug(f"help without torch failed: {error!r}")
-    return _parsed(name, rest, verbs)
+    return _parse_verb(words)
 
 
-def _parsed(name: str, words: list[str], verbs: Mapping[str, tuple[str, str]], recipe: str | None = None) -> Any:
+def _parse_verb(words: Sequence[str]) -> Any:
+    """The verb, or its help, or one line of complaint."""
+    names = {**COMMANDS, **OLD_COMMANDS}
+    name = next((name for name in (" ".join(words[:2]), words[0]) if name in names), None)
+    if name is None:
+        _explain_actions(words[0], words[1:])
+    rest = list(words[len(name.split()) :])
+    if name in COMMANDS:
+        return _parsed(name, rest, COMMANDS[name])
+    module, _, attribute = OLD_COMMANDS[name].partition(":")
+    return _parsed(name, rest, getattr(importlib.import_module(module), attribute))
+
+
+def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
+    """Print the actions of a verb, or say that one is missing or unknown."""
+    actions = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{verb} ")]
+    if not any(word in HELP for word in words):
+        raise ConfigError(explain_action(words, actions))
+    print(f"usage: rlftsim {verb} [-h] {{{','.join(actions)}}}\n\n{ACTIONS[verb]}\n")
+    for action in actions:
+        summary, _, _ = describe(COMMANDS[f"{verb} {action}"].function).partition("\n")
+        width = shutil.get_terminal_size().columns
+        print(textwrap.fill(summary, width, initial_indent=f"  {action:9}", subsequent_indent=" " * 11))
+    raise SystemExit(0)
+
+
+def _parsed(name: str, words: list[str], command: Any, recipe: str | None = None) -> Any:
     """The verb, or its help, or one line of complaint. Defaults are those of a recipe; None = guessed."""
-    # Imported late: the overview of verbs does not need tyro, and most verbs do not need recipes.
-    import tyro
-
-    module, attribute = verbs[name]
-    verb, stored = getattr(importlib.import_module(module), attribute), words
+    verb, stored = command, words
     has_settings = hasattr(verb, "sections")
     if has_settings:
+        # imported late: most verbs need no recipes
         from rlftsim.cli.recipe_verb import with_settings
 
         verb, stored = with_settings(verb, words, recipe)
 
-    def cli(these: list[str]) -> Any:
-        return tyro.cli(verb, args=these, prog=f"rlftsim {name}", config=(tyro.conf.OmitSubcommandPrefixes,))
+    parser = command.parser() if isinstance(command, Command) else dataclass_parser(verb)
+
+    def cli(arguments: list[str]) -> Any:
+        return tyro.cli(parser, args=arguments, prog=f"rlftsim {name}", config=(tyro.conf.OmitSubcommandPrefixes,))
 
     if any(word in HELP for word in words):
         return cli(stored)
@@ -87,11 +124,11 @@ def _parsed(name: str, words: list[str], verbs: Mapping[str, tuple[str, str]], r
         raise ConfigError(message) from None
     # A word behind a switch may have been mistaken for its value; tyro knows which word is the recipe.
     if has_settings and parsed.recipe != verb.starting_name:
-        return _parsed(name, words, verbs, parsed.recipe)
+        return _parsed(name, words, command, parsed.recipe)
     # Warnings on the way, such as that of a reward that is registered twice, are shown after all.
     if complaint.getvalue():
         log.warning(complaint.getvalue().rstrip())
-    _refuse_values(parsed, [name, *words])
+    _check_values(parsed, [*name.split(), *words])
     if hasattr(parsed, "refuse_useless"):
         parsed.refuse_useless(flags_of(words))
     return parsed
@@ -123,31 +160,30 @@ def _wide() -> Iterator[None]:
             os.environ["COLUMNS"] = before
 
 
-def _refuse_values(verb: Any, words: Sequence[str]) -> None:
-    """Refuse zero and less where something is counted, no value where some are listed, and addresses of buckets in
-    place of paths.
+def _check_values(verb: Any, words: Sequence[str]) -> None:
+    """Check that what is counted is positive, that lists have values, and that paths are no addresses of buckets.
 
     Args:
-        verb: as parsed, or a part of it.
-        words: the whole command.
+        verb: Verb as parsed, or settings whose flags stand among those of the verb.
+        words: The whole command.
 
     Raises:
-        ConfigError: names the flag, or the commands that do it.
+        ConfigError: A value that makes no sense; names the flag, or the commands that do it.
     """
-    for field in fields(verb):
-        value, flag = getattr(verb, field.name), f"--{field.name.replace('_', '-')}"
-        if field.name in COUNTS and isinstance(value, int) and value < 1:
+    values = getattr(verb, "values", None) or {field.name: getattr(verb, field.name) for field in fields(verb)}
+    for name, value in values.items():
+        flag = f"--{name.replace('_', '-')}"
+        if name in COUNTS and isinstance(value, int) and value < 1:
             raise ConfigError(f"{flag} must be at least 1, got {value}.")
-        if value == [] and flag in words:
+        if value in ([], ()) and flag in words:
             raise ConfigError(f"{flag} needs at least one value.")
         if isinstance(value, Path) and ADDRESS.match(str(value)):
-            _refuse_address(value, words)
-        # Fields of these two are shown without a prefix, so they belong to the verb.
-        if field.name in ("config", "action") and is_dataclass(value):
-            _refuse_values(value, words)
+            _explain_address(value, words)
+        if name in ("config", "action", "work", "sampling") and is_dataclass(value):
+            _check_values(value, words)
 
 
-def _refuse_address(path: Path, words: Sequence[str]) -> None:
+def _explain_address(path: Path, words: Sequence[str]) -> None:
     """Refuse an address of a bucket in place of a path, with the commands that bring the result there.
 
     Args:

@@ -21,8 +21,8 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.goal_relabeling import NOT_VALIDATED
-from rlftsim.training.method import METHODS, method_by_name
 from rlftsim.training.parallel import is_first_process
+from rlftsim.training.registry import METHODS, method_by_name
 
 VALIDATION = "validation"
 """Split that is validated on where none is named."""

@@ -3,7 +3,7 @@
     import gymnasium
     env = gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", data="synthetic", traffic="policy", action="bicycle")
 
-Importing this module registers the environments. It needs the extra `env`: `pip install 'rlftsim[env]'`.
+Importing this module registers the environments, and needs the extra `env`: `pip install 'rlftsim[env]'`.
 """
 
 from rlftsim.errors import ConfigError

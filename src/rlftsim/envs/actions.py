@@ -1,6 +1,6 @@
-"""Actions of planners: what a number means, and the motion it leads to.
+"""Actions of planners: meanings of the numbers, and the motion that follows.
 
-M agents, h steps of 0.1 s. Motion: x, y, heading, vx, vy; meters, seconds, radians. An agent's own frame has its origin
+M agents, h steps of 0.1 s. Motion: x, y, heading, vx, vy; meters, seconds, radians. An agent's own frame has the origin
 in the center of the box and x ahead.
 """
 
@@ -90,14 +90,14 @@ def build_controls(
 
     Args:
         action_type: Name of the action, as the setting `action` has it.
-        policy: Traffic model, whose motion tokens are the choices of a "token"; not used otherwise.
+        policy: Traffic model with the motion tokens that a "token" chooses from; not used otherwise.
         horizon: Number of poses of a "trajectory", 5 to 80.
-        tracker: Execution of a trajectory: "perfect" puts the agent there, "bicycle" steers for it.
+        tracker: Execution of a trajectory: "perfect" puts the agent on the pose, "bicycle" steers for the pose.
         reverse: True = a bicycle may drive backwards.
         hard_braking: True = a bicycle's lowest action brakes with 8 m/s² in place of 4.
 
     Raises:
-        ConfigError: No such action, or one that the policy has no tokens for.
+        ConfigError: No such action, or an action that the policy has no tokens for.
     """
     bicycle = Bicycle(reverse=reverse, max_braking=MAX_BRAKING_MPS2 if hard_braking else ACCELERATION_MPS2)
     if action_type == "bicycle":
@@ -125,12 +125,12 @@ def validate_actions(action: Any, controls: Controls, agent_name: Callable[[int]
 
     Args:
         action: Numbers in shape [count, *limits.shape], or whole numbers [count] for discrete controls.
-        controls: Controls that the actions are meant for; shape, bounds and number type come from them.
+        controls: Controls that the actions are meant for; shape, bounds and number type come from the controls.
         agent_name: Name of the agent in a row, for messages.
         count: Number of agents, the length of the first axis.
 
     Raises:
-        ConfigError: No numbers, another shape, a NaN, or no such discrete action; names agent and entry.
+        ConfigError: No numbers, a wrong shape, a NaN, or no such discrete action; names agent and entry.
     """
     shape = (count, *controls.limits.shape)
     try:
@@ -182,13 +182,13 @@ class Bicycle(Controls):
     ) -> Float[np.ndarray, "*m 5"]:
         """Motion after 0.1 s at constant acceleration and steering; the turn is integrated exactly.
 
-        A bicycle that may not drive backwards but does so at first brakes with 4 m/s² until it stands.
+        A bicycle that may not drive backwards but does so at first brakes with 4 m/s² to a standstill.
 
         Args:
             motion: Motion of the vehicles before, map frame.
             acceleration: Acceleration along the heading, m/s².
             steering: Angle of the front wheel, rad, positive to the left.
-            length: Length of the vehicles, m; the wheelbase is 0.6 of it.
+            length: Length of the vehicles, m; the wheelbase is 0.6 of the length.
         """
         x, y, heading = motion[..., 0], motion[..., 1], motion[..., 2]
         speed = signed_speed(motion)
@@ -273,7 +273,7 @@ class TokenControls(Controls):
     """A motion token of the traffic model, carried out for half a second.
 
     Args:
-        policy: Traffic model, whose vocabulary the actions count through.
+        policy: Traffic model with the vocabulary that the actions count through.
     """
 
     steps = STEPS_PER_TOKEN
@@ -307,7 +307,7 @@ def pursue(point: Float[np.ndarray, "*m 2"], length: Float[np.ndarray, "*#m"]) -
 
     Args:
         point: Point to steer for, in the vehicle's own frame, m.
-        length: Length of the vehicle, m; the wheelbase is 0.6 of it.
+        length: Length of the vehicle, m; the wheelbase is 0.6 of the length.
     """
     squared = np.maximum((point * point).sum(-1), 0.01)
     steering = np.arctan(2 * WHEELBASE_PER_LENGTH * length * point[..., 1] / squared)
@@ -329,7 +329,7 @@ def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:
 def to_heading_frame(
     x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"], heading: Float[np.ndarray, "*#m"]
 ) -> tuple[Float[np.ndarray, "*m"], Float[np.ndarray, "*m"]]:
-    """Components of vectors along headings and to the left of them.
+    """Components of vectors along headings and to the left of the headings.
 
     Args:
         x: First components in the map frame, in the unit of the result.

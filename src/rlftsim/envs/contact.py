@@ -1,4 +1,4 @@
-"""Collisions of a planner's agent, their type and their fault, after nuPlan's definition; lanes that a box is in.
+"""Collisions of a planner's agent, with type and fault, after nuPlan's definition; lanes that a box is in.
 
 Boxes have sharp corners, as nuPlan's. Motion: x, y, heading, vx, vy; map frame, meters, seconds.
 """
@@ -27,7 +27,7 @@ SUBDIVISIONS = 3
 
 
 class CollisionType(StrEnum):
-    """Types of collisions, in the order in which they are tested."""
+    """Types of collisions, in the order of the tests."""
 
     STOPPED_EGO = "stopped_ego"
     STOPPED_TRACK = "stopped_track"
@@ -40,7 +40,7 @@ class CollisionType(StrEnum):
 
 @dataclass(frozen=True)
 class Collision:
-    """The first contact with one track."""
+    """The first contact with a track."""
 
     step: int
     """Step of the episode, 1 = after the first action."""
@@ -67,7 +67,7 @@ def classify_collision(
     """Type and fault of a contact.
 
     Args:
-        scene: Scene whose lanes decide whether the ego is in one lane.
+        scene: Scene with the lanes that decide whether the ego is in a single lane.
         step: Step of the episode at which the boxes first overlap.
         agent: Row of the track in the scene's agent axis.
         ego: Motion of the planner's agent at the step.
@@ -158,12 +158,12 @@ def lane_search(scenario: Scenario) -> LaneSearch | None:
 def in_one_lane(
     scene: Scene, motion: Float[np.ndarray, "n c"], size: Float[np.ndarray, "_"], ground: Float[np.ndarray, "n"]
 ) -> Bool[np.ndarray, "n"]:
-    """True where all corners of a box are within the half width of one lane, or of lanes that merge or follow.
+    """True where all corners of a box are within the half width of a single lane, or of lanes that merge or follow.
 
-    Without lanes a box is in none.
+    Without lanes the result is False.
 
     Args:
-        scene: Scene whose lanes are searched.
+        scene: Scene with the lanes to search.
         motion: x, y, heading of a box at n steps, map frame; further columns are ignored.
         size: Length and width of the box, m.
         ground: Height of the ground under the box at each step, m.

@@ -1,6 +1,6 @@
-"""Planners measured: every scenario driven in several kinds of traffic, scores in one file for each kind.
+"""Planners measured: every scenario driven in several kinds of traffic, scores in a file for each kind.
 
-Interrupted in any way, the same call goes on where it was, see `evaluation.resumable`.
+Interrupted in any way, the same call goes on where the work stopped, see `evaluation.resumable`.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ from rlftsim.evaluation.resumable import (
     check_same_work,
     check_scenarios_stay,
     finish_result,
-    read_stored,
+    read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.progress import log
@@ -40,7 +40,7 @@ from rlftsim.viewer.film import to_film
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """A planner, its scenarios and its traffic."""
+    """A planner, the scenarios and the traffic."""
 
     planner: str
     """Name of a planner, or package.module:Class."""
@@ -74,7 +74,7 @@ class DriveConfig:
             raise ConfigError(f"scenarios names one twice: {', '.join(self.scenarios or ())}.")
 
     def settings(self, traffic: str) -> EnvConfig:
-        """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
+        """Settings of the environment for a kind of traffic: no event ends an episode, and no reward is given."""
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic), stop_on=(),
             reward="none", **read_action_settings(load_planner(self.planner)),
@@ -84,8 +84,8 @@ class DriveConfig:
 def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     """Scores of a planner in each kind of traffic, written to OUT/PLANNER-TRAFFIC.parquet.
 
-    Interrupted in any way, the same call goes on where it was. A kind of traffic that is finished is read from its
-    file, with a message. A planner whose file has changed is driven anew.
+    Interrupted in any way, the same call goes on where the work stopped. A kind of traffic that is finished is read
+    from the file, with a message. A planner with a changed file is driven anew.
 
     Args:
         config: Planner, data, kinds of traffic and number of rollouts.
@@ -121,17 +121,17 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
-    """Drive one scenario from the current step to the end.
+    """Drive a scenario from the current step to the end.
 
     Args:
-        env: Environment whose type of action is the planner's.
+        env: Environment with the planner's type of action.
         planner: Planner that drives, made by `load_planner`.
         scenario: Scenario of the environment to drive to the end.
         seed: Seed of the traffic; equal seeds, equal traffic for every planner.
-        rollout: Number of the rollout, 0 or more; each has dice of its own.
+        rollout: Number of the rollout, 0 or more; each with dice of its own.
 
     Raises:
-        DataError: the planner calls exit(). Any other error of the planner passes as it is.
+        DataError: the planner calls exit(). Any other error of the planner passes unchanged.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
     try:
@@ -148,7 +148,7 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
 
 
 def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult | None:
-    """The result of an earlier call for the same scenarios in one kind of traffic; None if there is none.
+    """The result of an earlier call for the same scenarios in the same kind of traffic; None if there is none.
 
     Args:
         config: Planner, data and scenarios of the call.
@@ -182,8 +182,8 @@ def _differences(stored: DriveSettings, current: DriveSettings) -> list[str]:
 def _read_and_refuse(
     config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
 ) -> DriveResult | None:
-    """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
-    result = read_stored(path, DriveResult.read)
+    """The stored result, unless of other work, or a limit or a choice would leave out some of the stored scenarios."""
+    result = read_finished(path, DriveResult.read)
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
     if result is not None and choice:
         left_out = len({*result.scenario_ids} - {*ids})
@@ -197,7 +197,7 @@ def _read_and_refuse(
 
 
 def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult:
-    """Drive what is missing in one kind of traffic and write the result, unless it is finished.
+    """Drive the missing scenarios in a kind of traffic and write the result, unless finished.
 
     Args:
         config: Planner, data, scenarios and processes of the call.
@@ -224,7 +224,7 @@ def _combine(settings: DriveSettings, rows: Sequence[tuple[dict[str, Any], dict[
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Row of a scenario, and the scores that it cannot give, as their file has them.
+    """Row of a scenario, and the scores that the scenario cannot give, as the file has both.
 
     Raises:
         KeyError, TypeError, ValueError: the file was cut or edited.
@@ -237,7 +237,7 @@ def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[
 
 
 def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], position: int) -> dict[str, object]:
-    """Row of one scenario, and the scores that it cannot give."""
+    """Row of a scenario, and the scores that the scenario cannot give."""
     env, planner = _environment(config, traffic), load_planner(config.planner)
     scenario = env.source.scenario(ids[position])
     results = [
@@ -255,12 +255,12 @@ def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], posit
 
 @lru_cache(maxsize=8)
 def _environment(config: DriveConfig, traffic: str) -> EgoEnv:
-    """Environment of one kind of traffic, made once in each process."""
+    """Environment of a kind of traffic, made once in each process."""
     return EgoEnv(source=Source(config.settings(traffic)))
 
 
 def film(config: DriveConfig, out: Path) -> Path:
-    """Write a film of the first scenario, the kinds of traffic side by side; returns its path.
+    """Write a film of the first scenario, the kinds of traffic side by side; returns the path.
 
     Args:
         config: Planner, data, kinds of traffic and number of rollouts.

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: a planner drives the ego of a scenario, a traffic model the others."""
+"""The Gymnasium environment: a planner drives the ego of a scenario, a traffic model all other agents."""
 
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -26,12 +26,12 @@ RENDER_DOTS_PER_INCH = 100
 
 
 class EgoEnv(gymnasium.Env):
-    """One scenario at a time; `gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)` makes it.
+    """A scenario at a time; made by `gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)`.
 
     Args:
         scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
-        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
-        settings: Fields of `EnvConfig` by name; the other fields have their defaults.
+        policy: Traffic model in place of the model that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; all other fields have defaults.
         source: Scenarios, model and settings that are loaded already, in place of the other arguments.
     """
 
@@ -65,7 +65,7 @@ class EgoEnv(gymnasium.Env):
 
     @property
     def state(self) -> EpisodeState:
-        """Its present state, a value."""
+        """The present state, a value."""
         return self._running[1]
 
     @property
@@ -103,13 +103,13 @@ class EgoEnv(gymnasium.Env):
         return self._look(), describe_start(episode, self.state, 0, self.source)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Carry out one action.
+        """Carry out an action.
 
         Args:
             action: Planner action, a member of `action_space`.
 
         Raises:
-            ConfigError: before `reset`, after the end, or an action with a NaN or of another shape.
+            ConfigError: before `reset`, after the end, or an action with a NaN or of a wrong shape.
         """
         episode, state = self._running
         if state.ended[0]:
@@ -152,7 +152,7 @@ class EgoEnv(gymnasium.Env):
         return self._camera.frame([Panel("planner", motion)], 0, len(self.state.world.track) - 1)
 
     def snapshot(self) -> bytes:
-        """The running episode as bytes, to be restored in this or another process with the same data and model."""
+        """The running episode as bytes, to be restored in this or any process with the same data and model."""
         return write_snapshot(self.episode, self.state, self.source.fingerprint)
 
     def restore(self, saved: bytes) -> tuple[Any, dict[str, Any]]:
@@ -162,14 +162,14 @@ class EgoEnv(gymnasium.Env):
             saved: Bytes that `snapshot` returned.
 
         Raises:
-            ConfigError: of another model, or of other settings.
-            DataError: no snapshot, or a damaged one.
+            ConfigError: A snapshot of a different model, or of other settings.
+            DataError: no snapshot, or a damaged snapshot.
         """
         self._go_on(*read_snapshot(saved, self.source))
         return self._look(), describe_start(self.episode, self.state, 0, self.source)
 
     def _go_on(self, episode: Episode, state: EpisodeState) -> None:
-        """Take over a running episode; the next ones follow from its seed, with the next rollouts."""
+        """Take over a running episode; the next episodes follow from the same seed, with the next rollouts."""
         dice = state.world.dice[-1][0]
         super().reset(seed=dice.seed)
         self._begun, self._seed, self._count = (episode, state), dice.seed, dice.rollout + 1

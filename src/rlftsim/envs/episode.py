@@ -1,6 +1,6 @@
-"""Episodes: a world whose agents are driven by actions, with events, rewards and ends.
+"""Episodes: a world with agents that are driven by actions, with events, rewards and ends.
 
-B scenes in step, M planner-driven agents over all of them. An `Episode` does not change, an `EpisodeState` is a value.
+B scenes in step, M planner-driven agents over all scenes. An `Episode` does not change, an `EpisodeState` is a value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,7 +58,7 @@ class Episode:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeState:
-    """One moment of an episode."""
+    """A moment of an episode."""
 
     world: WorldState
     touched: Bool[np.ndarray, "M A"]
@@ -116,7 +116,7 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     """The first state.
 
     Args:
-        episode: Episode whose world, map and settings do not change.
+        episode: Episode with the constant world, map and settings.
         dice: Randomness of the traffic, per scene.
     """
     world = begin(episode.world, dice)
@@ -136,15 +136,15 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
 
 
 def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[EpisodeState, Outcome]:
-    """State and outcome after one action of every planner-driven agent.
+    """State and outcome after an action of every planner-driven agent.
 
     Args:
-        episode: Episode whose world, map and settings do not change.
+        episode: Episode with the constant world, map and settings.
         state: State before the action; not changed.
-        action: Planner actions [M, *shape]; those of agents whose episode is over are ignored.
+        action: Planner actions [M, *shape]; actions of agents whose episode is over are ignored.
 
     Raises:
-        ConfigError: no numbers, a NaN, another shape, or an action that an agent cannot take.
+        ConfigError: no numbers, a NaN, a wrong shape, or an action that an agent cannot take.
     """
     motion = own_motion(episode, state.world)
     scene, agent = episode.world.actors.T
@@ -180,10 +180,10 @@ def repeat(
     motion: Float[np.ndarray, "T M 5"],
     dice: Sequence[tuple[Dice, ...]],
 ) -> EpisodeState:
-    """The state after steps whose motion is known.
+    """The state after steps of given motion.
 
     Args:
-        episode: Episode whose world, map and settings do not change.
+        episode: Episode with the constant world, map and settings.
         state: First state of the episode.
         motion: Motion of the planner-driven agents after each step.
         dice: Dice of each scene at each decision of the traffic; the last entry is for decisions to come.
@@ -215,7 +215,7 @@ def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
 
 
 def _with_ends(episode: Episode, state: EpisodeState) -> EpisodeState:
-    """The same state, with the agents marked whose episode ends here."""
+    """The same state, with marks for the agents whose episode ends here."""
     is_over = state.world.step >= episode.config.max_steps
     return replace(state, ended=state.ended | _stopped(episode, state) | is_over)
 
@@ -273,7 +273,7 @@ def own_motion(episode: Episode, world: WorldState) -> Float[np.ndarray, "M 5"]:
     """Present motion of the planner-driven agents.
 
     Args:
-        episode: Episode whose world, map and settings do not change.
+        episode: Episode with the constant world, map and settings.
         world: State of the episode's scenes, at any step.
     """
     scene, agent = episode.world.actors.T
@@ -284,7 +284,7 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
     """Observations of all planner-driven agents.
 
     Args:
-        episode: Episode whose world, map and settings do not change.
+        episode: Episode with the constant world, map and settings.
         state: Present state of the episode.
     """
     config = episode.config
@@ -292,16 +292,16 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
 
 
 def _ground(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Height of the ground under planner-driven agents: that of their boxes' undersides."""
+    """Height of the ground under planner-driven agents: the undersides of the boxes."""
     scene, agent = episode.world.actors[rows].T
     return world.z[-1][scene, agent] - episode.world.height[scene, agent] / 2
 
 
 def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Signed distance of the corner farthest off the road, negative on it; that of the official metric.
+    """Signed distance of the corner farthest off the road, negative on the road, as in the official metric.
 
     Args:
-        episode: Episode whose world, map and settings do not change.
+        episode: Episode with the constant world, map and settings.
         world: State of the episode's scenes, at any step.
         rows: Rows of the planner-driven agents to measure.
     """
@@ -322,7 +322,7 @@ def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]
 
 
 def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Distance that agents may move by before a corner can be 0.3 m off the road; at most 0 where one is.
+    """Distance that agents may move by before a corner can be 0.3 m off the road; at most 0 where a corner is.
 
     The search for the official distance is slow. Where all corners are clearly to the left of the simplified edges of
     the observations, these decide, unless edges lie above each other.
@@ -357,7 +357,7 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
-    """Distance of each agent along its route, as `Route.progress`, for all at once."""
+    """Distance of each agent along the route, as `Route.progress`, for all at once."""
     atlas, row = episode.atlas, np.arange(len(motion))
     dx = motion[:, :1] - atlas.route_points[..., 0]  # [M, r]; padding is far away
     dy = motion[:, 1:2] - atlas.route_points[..., 1]

@@ -1,6 +1,6 @@
 """The intelligent driver model (Treiber, Hennecke, Helbing, 2000) along lines: for planners and for traffic.
 
-M agents with a line of W points each, one every meter from the agent's center on; K other boxes. Meters, seconds.
+M agents with a line of W points each, a point every meter from the agent's center on; K other boxes. Meters, seconds.
 """
 
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ def find_leaders(
     box_size: Float[np.ndarray, "M K 2"],
     mask: Bool[np.ndarray, "M K"],
 ) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
-    """Gap to the first box that meets the swept line and its speed along the line; infinite and 0 without one.
+    """Gap to the first box that meets the swept line, and the box's speed along the line; infinite and 0 without a box.
 
     Args:
         line: Points ahead of each agent, a meter apart, map frame.
@@ -109,7 +109,7 @@ def find_leaders(
 
 @dataclass(frozen=True, eq=False)
 class IdmLines:
-    """The ways of the IDM-driven agents of one scenario: logged ways, from their current poses on."""
+    """The ways of the IDM-driven agents of a scenario: logged ways, from the current poses on."""
 
     agents: np.ndarray
     """Their rows, [M]."""
@@ -128,7 +128,7 @@ class IdmLines:
 
 
 def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
-    """Lines of those of some agents that drive in their logs; the others stay parked.
+    """Lines of the agents that drive in the log; all other agents stay parked.
 
     Args:
         scene: Scene with the log, the lights and the levels of the agents.
@@ -162,7 +162,7 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
 
 
 def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
-    """Poses of an agent's log where it moves, and a last one straight on."""
+    """Poses of an agent's log where the agent moves, and a last pose straight on."""
     logged = scene.logged[agent, CURRENT_STEP:TOTAL_STEPS]
     step = np.linalg.norm(np.diff(logged[:, :2], axis=0), axis=1)
     poses = logged[np.append(True, step > 0.05), :3]
@@ -189,7 +189,7 @@ def advance_idm(
     """Places and states of the IDM-driven agents of a scenario after 0.1 s.
 
     Args:
-        lines: Lines of the IDM-driven agents, from their current poses on.
+        lines: Lines of the IDM-driven agents, from the current poses on.
         idm_state: Distance along the line, m, and speed, m/s.
         motion: Motion x, y, heading, vx, vy of all agents before the step.
         z: Heights of the centers of all agents, m.

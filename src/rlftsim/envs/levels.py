@@ -1,4 +1,4 @@
-"""Levels: roads above each other, as at a bridge, and which of them an agent is on.
+"""Levels: roads above each other, as at a bridge, and the level that an agent is on.
 
 Heights count only in scenes that have levels. Elsewhere the ground has a single height at each position, so that boxes
 which meet in the plane meet in space, on slopes too. M agents, n things; frame: map, z as logged, meters.
@@ -12,12 +12,10 @@ from scipy.spatial import KDTree
 
 from rlftsim.realism.map_based import HEIGHT_STRETCH
 
-CELL_M = 5.0
-LEAST_GAP_M = 1.0
-"""Ground heights within a cell that differ by more than this are levels: one box may stand below another. Of 287 real
-scenarios 6 have such, in nine of ten it is less than 0.6."""
-LEVEL_M = 2.5
-"""Lanes within this height of an agent's ground are on its level: maps and boxes are inexact. Boxes meet by heights."""
+CELL_M = 3.5
+LEVEL_M = 1.5
+"""Ground heights within a cell that differ by more than the height of a car are levels. The diagonal of a cell rises by
+as much on slopes of 30 %, where boxes that touch may differ in height by more than half the sum of their heights."""
 STEP_UP_M = 1.5
 """Largest step of the ground that an agent follows; beyond it the agent keeps its height."""
 GRADE, FLAT_M = 0.15, 2.0
@@ -36,7 +34,7 @@ class Levels:
 
         Args:
             points: Positions after the step.
-            ground: Heights of the ground before it.
+            ground: Heights of the ground before the step.
         """
         _, nearest = self.tree.query(np.column_stack([points, HEIGHT_STRETCH * ground]))
         height = self.tree.data[nearest, 2] / HEIGHT_STRETCH
@@ -45,7 +43,7 @@ class Levels:
     def follow_lines(
         self, lines: Float[np.ndarray, "n p 2"], ground: Float[np.ndarray, "n"]
     ) -> Float[np.ndarray, "n p"]:
-        """Height of the ground along lines whose points are a few meters apart.
+        """Height of the ground along lines with points a few meters apart.
 
         Args:
             lines: Points of the lines, map frame, m.
@@ -63,7 +61,7 @@ def build_levels(ground: Float[np.ndarray, "p 3"]) -> Levels | None:
     Args:
         ground: Points on the ground.
     """
-    if not len(ground) or np.ptp(ground[:, 2]) <= LEAST_GAP_M:
+    if not len(ground) or np.ptp(ground[:, 2]) <= LEVEL_M:
         return None
     # two points within half a cell of each other share a cell of one of four grids
     for shift in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
@@ -71,7 +69,7 @@ def build_levels(ground: Float[np.ndarray, "p 3"]) -> Levels | None:
         order = np.lexsort((row, column))
         first = np.flatnonzero(np.append(True, (np.diff(column[order]) != 0) | (np.diff(row[order]) != 0)))
         z = ground[order, 2]
-        if (np.maximum.reduceat(z, first) - np.minimum.reduceat(z, first)).max() > LEAST_GAP_M:
+        if (np.maximum.reduceat(z, first) - np.minimum.reduceat(z, first)).max() > LEVEL_M:
             return Levels(KDTree(ground * [1.0, 1.0, HEIGHT_STRETCH]))
     return None
 
@@ -113,7 +111,7 @@ class RouteHeights:
     def differences(
         self, distances: Float[np.ndarray, "M n"], ground: Float[np.ndarray, "M"], above_route: Float[np.ndarray, "M"]
     ) -> Float[np.ndarray, "M n"]:
-        """Height differences between things and the road that leads there, less what slopes explain.
+        """Height differences between things and the road that leads there, less the part that slopes explain.
 
         Args:
             distances: Distance from each agent to each thing.

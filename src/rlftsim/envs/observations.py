@@ -1,9 +1,8 @@
 """Observations of planner-driven agents: arrays of fixed size, rows nearest first.
 
 M agents over B scenes; K neighbors, L pieces of lanes, E pieces of road edges, C crossings, T lights, R route points.
-Frame: the observing agent's own at the present step (x ahead, y left), or the map frame; meters, seconds, radians. Rows
-beyond what is there are zeros, and 0 in their mask. What lies above or below the agent's road, as at a bridge, is left
-out.
+Frame: the observing agent's own at the present step (x ahead, y left), or the map frame; meters, seconds, radians.
+Unused rows are zeros, and 0 in the mask. Things above or below the agent's road, as at a bridge, are left out.
 """
 
 from dataclasses import dataclass, fields
@@ -67,7 +66,7 @@ class Observation:
     """x, y of the route's end, and 1; zeros without a route."""
 
     def of_agent(self, row: int) -> dict[str, np.ndarray]:
-        """Arrays of one agent by name."""
+        """Arrays of an agent by name."""
         return {field.name: getattr(self, field.name)[row] for field in fields(self)}
 
     def by_name(self) -> dict[str, np.ndarray]:
@@ -75,7 +74,7 @@ class Observation:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def flat(self) -> Float32[np.ndarray, "M D"]:
-        """All numbers of each agent in one row, in the order of the fields."""
+        """All numbers of each agent in a row, in the order of the fields."""
         arrays = [getattr(self, field.name) for field in fields(self)]
         return np.concatenate([array.reshape(len(array), -1).astype(np.float32) for array in arrays], axis=1)
 
@@ -197,7 +196,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
 
 
 def _stack(arrays: list[np.ndarray], fill: float | int) -> np.ndarray:
-    """Arrays of different lengths, padded to the longest, at least to one row."""
+    """Arrays of different lengths, padded to the longest, at least to a single row."""
     longest = max(1, *(len(array) for array in arrays))
     return padded(arrays, (len(arrays), longest, *arrays[0].shape[1:]), fill)
 
@@ -328,7 +327,7 @@ def _leave_out_other_levels(
     nearest_on_route: Int64[np.ndarray, "M"],
     distances: dict[str, np.ndarray],
 ) -> None:
-    """Put what lies above or below the roads of the observing agents infinitely far away.
+    """Put things above or below the roads of the observing agents infinitely far away.
 
     Args:
         world: Scenes that step together.
@@ -379,7 +378,7 @@ def _distance(motion: Float[np.ndarray, "M 5"], points: np.ndarray) -> Float[np.
 def _nearest(
     distance: Float[np.ndarray, "M n"], count: int
 ) -> tuple[Int64[np.ndarray, "M k"], Bool[np.ndarray, "M k"]]:
-    """Indices of the nearest `count` columns of each row in order, and True where they are no farther than 100 m."""
+    """Indices of the nearest `count` columns of each row in order, and True up to a distance of 100 m."""
     row = np.arange(len(distance))[:, None]
     if distance.shape[1] > count:
         # the nearest in any order first: a full sort of all rows would cost more than all the rest

@@ -1,4 +1,4 @@
-"""The PettingZoo environment: a planner for each of several agents, in one scene."""
+"""The PettingZoo environment: a planner for each of several agents, in the same scene."""
 
 from collections.abc import Mapping, Sequence
 from operator import index
@@ -36,8 +36,8 @@ def parallel_env(
     Args:
         controlled: Planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
         scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
-        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
-        settings: Fields of `EnvConfig` by name; the other fields have their defaults.
+        policy: Traffic model in place of the model that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; all other fields have defaults.
 
     Raises:
         ConfigError: settings that do not fit each other, or no agents.
@@ -56,7 +56,7 @@ def parallel_env(
 
 
 class TrafficParallelEnv(ParallelEnv):
-    """Planner-driven agents of one scene, named by their object ids.
+    """Planner-driven agents of a scene, named by object ids.
 
     Args:
         controlled: Planner-driven agents: a group such as "vehicles", or object ids.
@@ -103,11 +103,11 @@ class TrafficParallelEnv(ParallelEnv):
 
         Args:
             seed: Seed of the order of scenarios and of the traffic; equal seeds, equal episodes.
-            options: Choices "scenario", "rollout" and "goals", as of `EgoEnv`; further names are ignored, as
-                PettingZoo allows them.
+            options: Choices "scenario", "rollout" and "goals", as of `EgoEnv`; further names are ignored, as PettingZoo
+                allows.
 
         Raises:
-            ConfigError: an unknown scenario, or no planner-driven agent in it.
+            ConfigError: an unknown scenario, or a scenario without a planner-driven agent.
         """
         if seed is not None:
             self._random, _ = seeding.np_random(seed)
@@ -128,14 +128,14 @@ class TrafficParallelEnv(ParallelEnv):
         return self._observe(self.agents), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
-        """Carry out one action of every agent that is left; those whose episode is over stand still.
+        """Carry out an action of every agent that is left; agents whose episode is over stand still.
 
         Args:
             actions: Agent name to planner action, for every name in `agents`.
 
         Raises:
-            ConfigError: before `reset`, after the end, an agent without an action, or one with a NaN or of another
-                shape.
+            ConfigError: before `reset`, after the end, an agent without an action, or an action with a NaN or of a
+                wrong shape.
         """
         if self._begun is None:
             raise ConfigError("this environment has no episode yet: call reset() first.")

@@ -47,7 +47,7 @@ VULNERABLE = (ObjectType.PEDESTRIAN, ObjectType.CYCLIST)
 
 @dataclass(frozen=True)
 class PlannerScores:
-    """Scores of one episode: higher is better, NaN = not measurable here. Names ending in _rate or _error: lower."""
+    """Scores of an episode: higher is better, NaN = not measurable here. Names ending in _rate or _error: lower."""
 
     nuplan_style: float
     pdms_style: float
@@ -81,10 +81,10 @@ class PlannerScores:
 
 
 def score_planner(record: Record) -> PlannerScores:
-    """All scores of one episode.
+    """All scores of an episode.
 
     Args:
-        record: Record of the episode; a short episode is scored for as long as it lasted.
+        record: Record of the episode; a short episode is scored up to the end.
     """
     components, missing = _score_components(record), missing_scores(record)
     early_components = _score_components(record.first(PDMS_STEPS))
@@ -155,7 +155,7 @@ def _weighted(components: dict[str, float], weights: dict[str, float]) -> float:
 
 
 def _collision_score(record: Record) -> float:
-    """Product over vulnerable road users, vehicles and objects: 0 after one collision at fault, with objects 0.5."""
+    """Product over vulnerable road users, vehicles and objects: 0 after a collision at fault, with objects 0.5."""
     agents = [collision.agent for collision in record.collisions if collision.at_fault]
     object_types = record.scene.object_type[agents].tolist()
     vulnerable = sum(object_type in VULNERABLE for object_type in object_types)
@@ -196,9 +196,10 @@ def _progress_ratio(record: Record) -> float:
 
 
 def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.ndarray, "T1"], Bool[np.ndarray, "T1"]]:
-    """Of the lane that fits each step best: its angle to the agent's heading, its limit, and True in a junction.
+    """Angle from the agent's heading to the best lane at each step, speed limit, and True in a junction.
 
-    NaN, 0 and False where there is no lane. Among the lanes that an agent's center is in, that which runs its way.
+    NaN, 0 and False where there is no lane. Best is, among the lanes around the agent's center, the lane with the
+    smallest angle.
     """
     search = lane_search(record.scene.scenario)
     angle, limit = np.full(record.steps + 1, math.nan), np.zeros(record.steps + 1)
@@ -233,10 +234,10 @@ def _speed_score(record: Record) -> float:
 
 
 def least_time_to_collision(record: Record) -> float:
-    """Least time until a box is met if all keep their speed and heading, s; at most 3.
+    """Least time until a box is met at constant speeds and headings, s; at most 3.
 
-    Tracks ahead and crossing ones count. Those beside the agent do only while it is not in one lane, or in a junction;
-    those behind, and those it has touched already, never do.
+    Tracks ahead and crossing tracks count. Tracks beside the agent count only while the agent is not in a single lane,
+    or is in a junction; tracks behind, and tracks already touched, never count.
     """
     agent_motion, motion = record.agent_motion, record.motion
     size = record.scene.size[:, :2]
@@ -274,7 +275,7 @@ def _are_on_level(
     steps: Int64[np.ndarray, "P"],
     time: Float[np.ndarray, "t"],
 ) -> Bool[np.ndarray, "P t"]:
-    """True where the heights of the planner's agent and of tracks overlap, if all keep their speed and heading."""
+    """True where the heights of the planner's agent and of tracks overlap, at constant speeds and headings."""
     z, height = [], record.scene.size[:, 2]
     for rows in (np.full_like(agents, record.agent), agents):
         states = record.motion[rows, steps]

@@ -14,7 +14,7 @@ from rlftsim.scenario.types import CURRENT_STEP
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One scene from the current step on: T steps of 0.1 s after it. Map frame."""
+    """A scene from the current step on: T further steps of 0.1 s. Map frame."""
 
     scene: Scene
     agent: int

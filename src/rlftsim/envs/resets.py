@@ -22,7 +22,7 @@ def build_config(settings: dict[str, Any]) -> EnvConfig:
     """Settings by name.
 
     Raises:
-        ConfigError: one that there is not.
+        ConfigError: No setting of that name.
     """
     unknown_fields = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
     if unknown_fields:
@@ -31,7 +31,7 @@ def build_config(settings: dict[str, Any]) -> EnvConfig:
 
 
 def draw_seed() -> int:
-    """A seed where none is given: one that fits an array of int64 and gives the same episodes again."""
+    """A random seed, which fits an array of int64 and gives the same episodes again."""
     return int(np.random.default_rng().integers(2**31))
 
 
@@ -45,7 +45,7 @@ def choose_scenario(
         source: Scenarios to choose from.
         options: Options of the reset by name; other names than `OPTIONS` are refused.
         seed: Seed of the traffic, a whole number.
-        count: Number of episodes since the seed, which is the rollout's number.
+        count: Number of episodes since the seed, which is the number of the rollout.
 
     Raises:
         ConfigError: an option that there is not.
@@ -66,7 +66,7 @@ def describe_start(episode: Episode, state: EpisodeState, row: int, source: Sour
         episode: Episode that the agent drives in.
         state: First state of the episode.
         row: Index of the agent among the planner-driven agents [M].
-        source: Source of the environment, for the fingerprint of its traffic model.
+        source: Source of the environment, for the fingerprint of the traffic model.
     """
     scene_row, agent = episode.world.actors[row]
     scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
@@ -84,7 +84,7 @@ def describe_start(episode: Episode, state: EpisodeState, row: int, source: Sour
 
 
 def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -> dict[str, Any]:
-    """Information after an action; at the end of the agent's episode with its `Result`.
+    """Information after an action; at the end of the agent's episode with the `Result`.
 
     Args:
         episode: Episode that the agent drives in.
@@ -117,7 +117,7 @@ def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
 
 
 def has_frozen_lights(episode: Episode, state: EpisodeState, row: int) -> bool:
-    """True where lights keep their last state as the log has no further ones.
+    """True where lights keep the last state as the log has no further states.
 
     Args:
         episode: Episode that the agent drives in.

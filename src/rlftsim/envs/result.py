@@ -1,4 +1,4 @@
-"""Results of episodes: scores, what they lack, pictures and films."""
+"""Results of episodes: scores, missing scores, pictures and films."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -21,7 +21,7 @@ SCORE_NAMES = tuple(field.name for scores in (PlannerScores, TrafficScores) for 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Outcome of one episode; scores are computed when they are first read."""
+    """Outcome of an episode; scores are computed when first read."""
 
     record: Record
 
@@ -32,7 +32,7 @@ class Result:
 
     @cached_property
     def traffic(self) -> TrafficScores:
-        """Scores of the traffic around it."""
+        """Scores of the traffic around the planner."""
         return score_traffic(self.record)
 
     @property
@@ -49,7 +49,7 @@ class Result:
         """Write a film, .mp4 or .webp.
 
         Args:
-            path: File to write; its ending .mp4 or .webp decides the format.
+            path: File to write; the ending .mp4 or .webp decides the format.
             title: Title above the picture, such as the planner's name.
         """
         to_film(path, build_animation({title: self.record}))
@@ -67,7 +67,7 @@ def to_scene_motion(record: Record, agents: AgentBoxes) -> SceneMotion:
 
     Args:
         record: Record of an episode, from the current step on.
-        agents: Boxes of the same agents, for marks where they overlap.
+        agents: Boxes of the same agents, for marks of overlaps.
     """
     log = logged_trajectories(record.scene.scenario)
     position = np.concatenate([log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]], 1)

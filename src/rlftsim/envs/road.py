@@ -1,4 +1,4 @@
-"""Road edges of scenarios, and points beside them.
+"""Road edges of scenarios, and points beside the edges.
 
 The official distance to the road edge searches long; where the nearest edge tells enough, `nearest_edges` is quick.
 """
@@ -26,15 +26,15 @@ def road_edges(scenario: Scenario) -> RoadEdges | None:
 def nearest_edges(
     points: Float[np.ndarray, "n p 2"], edges: Float[np.ndarray, "#n e 4"]
 ) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, "n p"], Bool[np.ndarray, "n p"]]:
-    """Distance of each point to the nearest edge, its side of that edge, and True where it is beside it.
+    """Distance of each point to the nearest edge, side of that edge, and True for points beside the edge.
 
     Args:
         points: Points to measure, map frame, m.
         edges: Segments x0, y0, x1, y1, at least one, m; the drivable side is on the left.
 
     Returns:
-        Distances, m; a positive number for points on the left, a negative one on the right; False for points beyond
-        the end of the edge, where the side says nothing.
+        Distances, m; a positive number for points on the left, a negative number on the right; False for points beyond
+        the end of the edge, where the side has no meaning.
     """
     edges = edges[:, None]  # [n, 1, e, 4]
     dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]

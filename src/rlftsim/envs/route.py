@@ -1,7 +1,7 @@
 """Routes: the middle of the lanes that a planner is to follow. Frame: map, m.
 
-A log has no route, so the default is the lanes that the logged agent drove, without its timing. It tells a planner
-*where* the logged driver went. `Route.source` says where a route comes from.
+A log has no route, so the default is the lanes that the logged agent drove, without the timing. Such a route tells a
+planner *where* the logged driver went. `Route.source` says where a route comes from.
 """
 
 from dataclasses import dataclass
@@ -68,12 +68,12 @@ NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zer
 
 @cached_on_scenario
 def find_route(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
-    """Route of an agent; without lanes there is none.
+    """Route of an agent; empty without lanes.
 
     Args:
-        scenario: Scenario whose lanes and log give the route.
+        scenario: Scenario with lanes and log for the route.
         agent: Row of the agent among the simulated agents.
-        choice: Kind of route: "logged" for the lanes of its log, "none", a maneuver that the lanes allow, or lane ids.
+        choice: Kind of route: "logged" for the lanes of the log, "none", a maneuver that the lanes allow, or lane ids.
 
     Raises:
         ConfigError: no such lane or maneuver.
@@ -142,7 +142,7 @@ def _lanes_of_other_levels(graph: LaneGraph, position: Float[np.ndarray, "3"]) -
 
 
 def _along_lanes(scene: Scene, agent: int, lane_ids: tuple[int, ...]) -> Float[np.ndarray, "n 2"]:
-    """The middle of lanes one after the other, from the point nearest to an agent on."""
+    """The middle of successive lanes, from the point nearest to an agent on."""
     row_of_id = {int(lane_id): row for row, lane_id in enumerate(scene.graph.lane_id)}
     unknown_ids = [lane_id for lane_id in lane_ids if lane_id not in row_of_id]
     if unknown_ids or not lane_ids:
@@ -178,7 +178,7 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
 
 
 def sample_line(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
-    """Points along a polyline from its start on.
+    """Points along a polyline from the start on.
 
     Args:
         line: Points of the polyline, at least two, m.
@@ -190,6 +190,6 @@ def sample_line(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.nd
 
 
 def compute_headings(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:
-    """Direction of polylines from each point to the next, rad; at the last point that of the segment before it."""
+    """Direction of polylines from each point to the next, rad; at the last point the direction of the last segment."""
     steps = np.diff(lines, axis=-2, append=2 * lines[..., -1:, :] - lines[..., -2:-1, :])
     return np.arctan2(steps[..., 1], steps[..., 0])

@@ -46,7 +46,7 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Carry them out: observations, rewards, ends and infos."""
+        """Carry out the actions: observations, rewards, ends and infos."""
         observation, rewards, terminated, truncated, notes = self.vector.step_slots(self._actions)
         for i in np.flatnonzero(terminated | truncated):
             ends = {"terminal_observation": notes[i]["final_obs"], "TimeLimit.truncated": bool(truncated[i])}
@@ -54,7 +54,7 @@ class SB3VecEnv(VecEnv):
         return observation, rewards.astype(np.float32), terminated | truncated, notes
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no files or windows are open."""
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """An attribute of the vector environment, once for each environment.
@@ -92,7 +92,7 @@ class SB3VecEnv(VecEnv):
         return [getattr(self.vector, method_name)(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: int | Iterable[int] | None = None) -> Sequence[bool]:
-        """False: environments are not wrapped one by one.
+        """False: environments are not wrapped separately.
 
         Args:
             wrapper_class: Class of a wrapper, not used: the answer is False for each.

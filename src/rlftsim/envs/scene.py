@@ -1,4 +1,4 @@
-"""One scenario as the environments see it: agents, log, lanes, edges, crossings and lights as arrays.
+"""A scenario as the environments see it: agents, log, lanes, edges, crossings and lights as arrays.
 
 Frame: map (centered on the scenario, meters), float64. Built once per scenario and cached with the scenario.
 """
@@ -55,7 +55,7 @@ class LaneSegments:
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """T traffic lights over the 91 steps of a log. Where the log has no further states, the last one holds."""
+    """T traffic lights over the 91 steps of a log. Where the log has no further states, the last state holds."""
 
     point: Float[np.ndarray, "T 2"]
     z: Float[np.ndarray, "T"]
@@ -70,7 +70,7 @@ class Lights:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Simulated agents (track order, A), their log, and the map."""
+    """Simulated agents (track order, A), log and map."""
 
     scenario: Scenario
     ego: int
@@ -199,7 +199,7 @@ def _cut_lanes(scenario: Scenario, graph: LaneGraph, lights: Lights) -> LaneSegm
 
 
 def _cut_edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, "e 4"], Float[np.ndarray, "e"]]:
-    """Segments of road edges, and their heights."""
+    """Segments of road edges, with heights."""
     features, segments, heights = scenario.map_features, [np.zeros((0, 4))], [np.zeros(0)]
     for index in features.find_indices(ROAD_EDGE_TYPES):
         line = features.polyline(index).astype(np.float64) - [*scenario.origin, 0.0]
@@ -217,7 +217,7 @@ def _cut_edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, 
 
 
 def _build_crossings(scenario: Scenario) -> tuple[Float[np.ndarray, "c 8"], Float[np.ndarray, "c"]]:
-    """Rectangles parallel to the longest side of each polygon, and their heights."""
+    """Rectangles parallel to the longest side of each polygon, with heights."""
     features, boxes, heights = scenario.map_features, [], []
     for index in features.find_indices(AREA_TYPES):
         polygon = features.polygon(index)

@@ -1,13 +1,13 @@
-"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format and a checksum, nothing that could run
-code.
+"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format and a checksum, no code.
 
-An episode follows from its scenarios, its dice and the planner's motion, so these are all that is stored. Reading runs
-the episode again, which gives equal bits: the same network calls on the same numbers.
+An episode follows from scenarios, dice and the planner's motion, so these are all that is stored. Reading runs the
+episode again, which gives equal bits: the same network calls on the same numbers.
 """
 
 import hashlib
 import json
 from dataclasses import asdict
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, check_types, in_short
 from rlftsim.jobs.documents import parse_json
 from rlftsim.scenario.types import CURRENT_STEP
 
@@ -58,8 +58,8 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         source: Source of the environment that continues the episode.
 
     Raises:
-        DataError: no snapshot, or a damaged one.
-        ConfigError: of another model, or of other settings.
+        DataError: no snapshot, or a damaged snapshot.
+        ConfigError: A snapshot of a different model, or of other settings.
     """
     if not isinstance(saved, bytes) or hashlib.sha256(saved[:-CHECKSUM_BYTES]).digest() != saved[-CHECKSUM_BYTES:]:
         raise DataError("not a snapshot of an episode, or a damaged one: take one with snapshot().")
@@ -77,7 +77,11 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
     try:
         dice = [tuple(Dice(**values) for values in row) for row in about["dice"]]
-    except TypeError as error:
+        for draw in chain.from_iterable(dice):
+            check_types(draw)
+            if min(draw.seed, draw.rollout) < 0:
+                raise ConfigError(f"negative dice: {in_short([draw.seed, draw.rollout])}")
+    except (TypeError, ConfigError) as error:
         raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
     return episode, repeat(episode, start(episode, dice[0]), motion[1:], dice)
 
@@ -86,7 +90,7 @@ def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
     """Description and motion [T + 1, M, 5] of a snapshot.
 
     Raises:
-        DataError: Something is missing, of another type or not finite.
+        DataError: A value is missing, of the wrong type or not finite.
     """
     try:
         arrays = load(body)

@@ -1,4 +1,4 @@
-"""Scenarios and the traffic model of an environment, loaded once and shared by all of its episodes."""
+"""Scenarios and the traffic model of an environment, loaded once and shared by all episodes."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -27,13 +27,13 @@ class Source:
     """Scenarios, traffic model and settings of an environment.
 
     Args:
-        config: Settings of the environment; `data` and `model` name what is loaded here.
+        config: Settings of the environment; `data` and `model` name the data set and the model to load.
         scenarios: Scenarios in place of the data set in `config`; a data set by name is read in the split of `config`.
-        policy: Traffic model in place of the one that `config` names, in evaluation mode.
+        policy: Traffic model in place of the model that `config` names, in evaluation mode.
         controlled: Rules of the planner-driven agents, which come before the drivers of `config`; None = the ego.
 
     Raises:
-        ConfigError: settings that do not fit each other.
+        ConfigError: settings that contradict each other.
         DataError: no such data set or split.
     """
 
@@ -68,10 +68,10 @@ class Source:
         self._contexts: OrderedDict[str, Any] = OrderedDict()
 
     def scenario(self, scenario_id: str) -> Scenario:
-        """A scenario by its id.
+        """A scenario by id.
 
         Raises:
-            ConfigError: there is none.
+            ConfigError: no such scenario.
         """
         try:
             return self.scenarios[self.scenario_ids.index(scenario_id)]
@@ -89,7 +89,7 @@ class Source:
             goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
 
         Raises:
-            ConfigError: drivers that do not fit, or goals for a policy that does not follow any.
+            ConfigError: drivers that do not fit, or goals for a policy that does not follow goals.
             DataError: a goal of an agent that is not simulated.
         """
         if goals and (self.policy is None or not is_goal_conditioned(self.policy)):
@@ -105,7 +105,7 @@ class Source:
         return build_episode(world, self.controls, self.config, goals)
 
     def _context(self, scenarios: list[Scenario]) -> Any:
-        """Context of a single scenario, from the last ones if it is among them; None leaves it to the world."""
+        """Context of a single scenario, reused if among the last contexts; None leaves the encoding to the world."""
         if self.policy is None or len(scenarios) != 1 or "policy" not in self.rules.values():
             return None
         key = scenarios[0].scenario_id

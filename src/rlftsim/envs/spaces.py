@@ -11,7 +11,7 @@ from rlftsim.envs.observations import BOUND, SHAPES, Observation
 
 
 def action_space(controls: Controls) -> spaces.Space:
-    """Space of one agent's actions."""
+    """Space of an agent's actions."""
     if controls.num_choices:
         return spaces.Discrete(controls.num_choices)
     limits = controls.limits.astype(np.float32)
@@ -19,7 +19,7 @@ def action_space(controls: Controls) -> spaces.Space:
 
 
 def observation_space(form: ObservationFormat) -> spaces.Space:
-    """Space of one agent's observations; "arrays" has the space of "dict"."""
+    """Space of an agent's observations; "arrays" has the space of "dict"."""
     if form == "flat":
         return spaces.Box(-BOUND, BOUND, (sum(math.prod(shape) for shape in SHAPES.values()),), np.float32)
     return spaces.Dict({
@@ -31,7 +31,7 @@ def observation_space(form: ObservationFormat) -> spaces.Space:
 
 
 def format_observation(observation: Observation, form: ObservationFormat, row: int | None = None):
-    """An observation in the form of its space.
+    """An observation in the form of the space.
 
     Args:
         observation: Observation of M agents.

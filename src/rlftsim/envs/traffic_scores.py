@@ -1,6 +1,7 @@
-"""Scores of the traffic around a planner: realism of the others, their reactivity, and the blame for collisions.
+"""Scores of the traffic around a planner: realism of the other agents, reactivity, and the blame for collisions.
 
-Reactivity counts the seven events of ReactSim-Bench (arXiv 2606.14058); its thresholds are ours where it names none.
+Reactivity counts the seven events of ReactSim-Bench (arXiv 2606.14058), with thresholds of ours where the paper names
+none.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ SLOW_MPS = 1.0
 
 @dataclass(frozen=True)
 class TrafficScores:
-    """Events of the other agents in one episode; rates are fractions of the other vehicles (contacts: of all)."""
+    """Events of the other agents in an episode; rates are fractions of the other vehicles (contacts: of all)."""
 
     ego_contacts: float
     """Tracks in contact with the planner's agent."""
@@ -50,7 +51,7 @@ class TrafficScores:
 
 
 def score_traffic(record: Record) -> TrafficScores:
-    """Events of the other agents in one episode."""
+    """Events of the other agents in an episode."""
     scene, motion = record.scene, record.motion
     is_traffic = np.arange(len(scene.object_id)) != record.agent
     is_vehicle = is_traffic & (scene.object_type == ObjectType.VEHICLE)
@@ -85,7 +86,7 @@ def score_traffic(record: Record) -> TrafficScores:
 
 
 def blamed_others_rate(collisions: Sequence[Collision]) -> float:
-    """Fraction of contacts with the planner's agent, in one episode or several, not its fault; NaN without."""
+    """Fraction of contacts without fault of the planner's agent, in one episode or several; NaN without contacts."""
     return sum(not collision.at_fault for collision in collisions) / len(collisions) if collisions else np.nan
 
 
@@ -101,7 +102,7 @@ def _runs(values: Shaped[np.ndarray, "A t"], length: int) -> Shaped[np.ndarray, 
 
 
 def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
-    """True = a corner leaves the road during the episode; those off it from the start do not count."""
+    """True = a corner leaves the road during the episode; agents off the road from the start do not count."""
     edges, scene = road_edges(record.scene.scenario), record.scene
     if edges is None:
         return np.zeros(len(scene.object_id), bool)
@@ -114,7 +115,7 @@ def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
 
 
 def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:
-    """True = drives 2 m or more within a second against every lane that it is in."""
+    """True = drives 2 m or more within a second against every lane around the agent."""
     search, is_against = lane_search(record.scene.scenario), np.zeros(len(vehicles), bool)
     if search is None:
         return is_against
@@ -146,9 +147,9 @@ class _WithoutEgo(Scenario):
 
 
 def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
-    """Realism meta-metric of the agents to predict, the ego left out, over rollouts of one scenario.
+    """Realism meta-metric of the agents to predict, the ego left out, over rollouts of a scenario.
 
-    NaN where it cannot be measured: no future, no road edges, an episode that ended early, or no other agent to
+    NaN where realism cannot be measured: no future, no road edges, an episode that ended early, or no other agent to
     predict.
 
     Args:

@@ -1,4 +1,4 @@
-"""Many ego environments at once: scenes that are reset together step together, with one network call for all."""
+"""Many ego environments at once: scenes that are reset together step together, with a single network call for all."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from rlftsim.scenario.any_form import AnyScenarios
 
 @dataclass(eq=False)
 class _Slot:
-    """One of the environments: its random numbers, and episodes since its seed."""
+    """A slot for an environment: random numbers, and episodes since the seed."""
 
     random: np.random.Generator
     seed: int
@@ -32,7 +32,7 @@ class _Slot:
 
 @dataclass(eq=False)
 class _Group:
-    """Scenes that were reset together. A scene whose slot has gone on to another group is carried along."""
+    """Scenes that were reset together. A scene is carried along after the slot has gone on to a new group."""
 
     episode: Episode
     state: EpisodeState
@@ -56,8 +56,8 @@ class EgoVectorEnv(VectorEnv):
         autoreset_mode: Time of Gymnasium's automatic resets: at the next step, in the same step, or by
             `reset(options={"reset_mask": ...})`.
         scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
-        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
-        settings: Fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
+        policy: Traffic model in place of the model that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; pictures and pages exist only for `EgoEnv`.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -110,7 +110,7 @@ class EgoVectorEnv(VectorEnv):
     def reset_slots(
         self, seed: int | Sequence[int | None] | None, options: dict[str, Any] | None = None
     ) -> tuple[Any, list[dict[str, Any]]]:
-        """As `reset`, with the infos of each slot by themselves.
+        """As `reset`, with the infos of each slot apart.
 
         Args:
             seed: Number s, which gives slot i the seed s + i; or a list with a seed per slot.
@@ -142,7 +142,7 @@ class EgoVectorEnv(VectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[Any, np.ndarray, Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], dict[str, Any]]:
-        """Carry out one action in every slot.
+        """Carry out an action in every slot.
 
         Args:
             actions: Planner actions [num_envs, ...], in the units of the action space.
@@ -159,20 +159,20 @@ class EgoVectorEnv(VectorEnv):
     def step_slots(
         self, actions: Any
     ) -> tuple[Any, np.ndarray, Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], list[dict[str, Any]]]:
-        """As `step`, with the infos of each slot by themselves.
+        """As `step`, with the infos of each slot apart.
 
         Args:
             actions: Planner actions [num_envs, ...], in the units of the action space.
 
         Raises:
-            ConfigError: before `reset`, or an action with a NaN or of another shape; with autoreset disabled a slot
+            ConfigError: before `reset`, or an action with a NaN or of a wrong shape; with autoreset disabled a slot
                 whose episode is over.
         """
         if not self._groups:
             raise ConfigError("these environments have no episodes yet: call reset() first.")
         controls = self.source.controls
         # all slots before any of them moves
-        actions = validate_actions(actions, controls, self._name_of, self.num_envs)
+        actions = validate_actions(actions, controls, self._describe_slot, self.num_envs)
         over = np.flatnonzero(self._over)
         if self.autoreset_mode == AutoresetMode.DISABLED and len(over):
             raise ConfigError(f"the episode of slot {over[0]} is over: reset it with options={{'reset_mask': ...}}.")
@@ -208,12 +208,12 @@ class EgoVectorEnv(VectorEnv):
                 notes[slot] |= {"final_obs": final_observation, "final_info": final[slot]}
         return self._observe(), rewards, terminated, truncated, notes
 
-    def _name_of(self, slot: int) -> str:
+    def _describe_slot(self, slot: int) -> str:
         group = next(group for group in self._groups if slot in group.slots)
         return f"slot {slot}, {group.episode.agent_name(int(np.flatnonzero(group.slots == slot)[0]))}"
 
     def _reset(self, slots: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
-        """Begin episodes of some slots, which form a group, and note what there is to say about them."""
+        """Begin episodes of some slots, which form a group, and note the infos of each episode."""
         picks = []
         for i in slots:
             slot = self._slots[i]

@@ -1,13 +1,14 @@
 """The world: B scenes that step together at 10 Hz, with traffic that decides every half second.
 
-A `World` holds what does not change in an episode, a `WorldState` is a value: stepping returns a new one and changes
-nothing, so a fork is the same state used twice. With a policy that decides for k steps, a block of k steps runs so:
+A `World` holds the constants of an episode, a `WorldState` is a value: stepping returns a new state and leaves the old
+state unchanged, so a fork is the same state used twice. With a policy that decides for k steps, a block of k steps runs
+so:
 
 1. Before its first step the policy decides for all agents and `advance` gives their k poses. The noise depends on seed,
-   scenario, rollout and decision alone, as in `rollout.simulate`: whatever a planner does, it meets the same dice.
-2. Each step moves the planner's agents by one step and reveals one pose of the others.
+   scenario, rollout and decision alone, as in `rollout.simulate`: whatever a planner does, the dice are the same.
+2. Each step moves the planner's agents by one step and reveals one pose of the other agents.
 3. After the last step `advance` is called again from the same state, with the poses of all agents that the policy did
-   not drive imposed. So the policy sees what the planner really did, 0.1 to 0.5 s later.
+   not drive imposed. So the policy sees the planner's true motion, 0.1 to 0.5 s later.
 
 Shapes: B scenes, A agents (padded), M agents that a planner drives, over all scenes. Frame: map of each scene, meters,
 seconds. Motion: x, y, heading, vx, vy.
@@ -40,7 +41,7 @@ Noise = Literal["same", "new"]
 
 @dataclass(frozen=True)
 class Dice:
-    """Randomness of one scene: the same numbers give the same traffic, as `simulate(seed=..., num_rollouts=...)`."""
+    """Randomness of a scene: the same numbers give the same traffic, as `simulate(seed=..., num_rollouts=...)`."""
 
     seed: int
     rollout: int = 0
@@ -48,7 +49,7 @@ class Dice:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """B scenes that step together, and who drives whom."""
+    """B scenes that step together, and the driver of each agent."""
 
     scenes: tuple[Scene, ...]
     batch: ScenarioBatch
@@ -94,7 +95,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class WorldState:
-    """B scenes at one step."""
+    """B scenes at a step."""
 
     track: tuple[Float[np.ndarray, "B A 5"], ...]
     """Motion at every step of the log's time from 0 to the present one."""
@@ -133,14 +134,14 @@ def build_world(
 
     Args:
         scenarios: Scenarios that step together, at least one.
-        policy: Traffic model; left out where the rules give no agent to it.
+        policy: Traffic model; left out where the rules give no agent to the policy.
         rules: Agents to driver, the first match wins, see `assign_drivers`.
         goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
         sampling: Temperature and truncation of the policy's decisions.
         context: Result of `policy.encode` for these scenarios; None = computed here.
 
     Raises:
-        ConfigError: a rule that does not fit, or agents that follow a policy where there is none.
+        ConfigError: a rule that does not fit, or agents that follow the policy where `policy` is left out.
     """
     scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
     batch = collate(scenarios)
@@ -186,11 +187,11 @@ def build_world(
 
 
 def padded(arrays: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
-    """Arrays that differ in the length of their first axis, in one array.
+    """Arrays that differ in the length of the first axis, in a single array.
 
     Args:
         arrays: Arrays of the same type, at least one.
-        shape: Shape of the result; its first axis has an entry for each array.
+        shape: Shape of the result; the first axis has an entry for each array.
         fill: Value beyond the end of each array.
     """
     out = np.full((len(arrays), *shape[1:]), fill, arrays[0].dtype)
@@ -200,7 +201,7 @@ def padded(arrays: list[np.ndarray], shape: tuple[int, ...], fill: float | int |
 
 
 def begin(world: World, dice: Sequence[Dice]) -> WorldState:
-    """The world at the current step of its logs.
+    """The world at the current step of the logs.
 
     Args:
         world: Scenes that step together, with the drivers of all agents.
@@ -279,7 +280,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
 def _follow_levels(
     world: World, z: Float[np.ndarray, "B A"], motion: Float[np.ndarray, "B A 5"], step: int
 ) -> Float[np.ndarray, "B A"]:
-    """Heights of the centers after a step: replayed agents have logged ones, the others stay on their level's ground.
+    """Heights of the centers after a step: replayed agents have logged heights, others stay on the ground of the level.
 
     Args:
         world: Scenes that step together.
@@ -298,17 +299,17 @@ def _follow_levels(
 
 
 def fork(world: World, state: WorldState, number: int, noise: Noise = "same") -> tuple[WorldState, ...]:
-    """States that go on from the same one: nothing is copied but the noise of the decisions to come.
+    """States that go on from the same state: only the noise of the decisions to come is copied.
 
     Args:
         world: Scenes that step together, with the drivers of all agents.
         state: State where the branches begin; not changed.
         number: Number of branches to return.
-        noise: Dice of the branches: "same" = all meet the dice of `state`; "new" = branch i meets those of
-            rollout + 1 + i, from the next decision on.
+        noise: Dice of the branches: "same" = all meet the dice of `state`; "new" = branch i meets the dice of
+            `rollout + 1 + i`, from the next decision on.
 
     Raises:
-        ConfigError: another word for the noise.
+        ConfigError: Neither "same" nor "new".
     """
     if noise not in get_args(Noise):
         raise ConfigError(f"noise must be one of {', '.join(get_args(Noise))}, got {in_short(noise)}.")
@@ -333,7 +334,7 @@ def with_dice(world: World, state: WorldState, dice: Sequence[Dice]) -> WorldSta
 
 
 def _decide(world: World, state: WorldState) -> Block:
-    """Decisions of the next block: the last one is finished with what really happened, then the policy decides."""
+    """Decisions of the next block: the last block is finished with the true motion, then the policy decides."""
     policy, block = world.policy, state.block
     assert policy is not None
     assert block is not None
@@ -350,7 +351,7 @@ def _decide(world: World, state: WorldState) -> Block:
 
 
 def _forced(world: World, state: WorldState) -> AgentStates | None:
-    """Last block's motion of the agents that the policy does not drive; None where it drives all."""
+    """Last block's motion of the agents that the policy does not drive; None where the policy drives all."""
     assert world.policy is not None
     imposed = world.mask & (world.drivers != Driver.POLICY)
     if not imposed.any():
@@ -369,7 +370,7 @@ def _decision_noise(world: World, dice: Sequence[Dice]) -> Tensor:
 
 
 def _noise(world: World, dice: Sequence[Dice], purpose: str, per_agent: int) -> Float[Tensor, "B 1 A k"]:
-    """Noise of scenes with dice of their own, as `simulate` draws it for each of them."""
+    """Noise of scenes with dice per scene, as `simulate` draws for each scene."""
     return torch.cat([
         draw_noise(
             scenario_batch, range(scene_dice.rollout, scene_dice.rollout + 1), seed=scene_dice.seed, purpose=purpose,

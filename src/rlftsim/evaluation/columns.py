@@ -11,8 +11,8 @@ ARROWS = {"higher": " ↑", "lower": " ↓", "log": ""}
 
 
 def find_direction(source: str) -> Literal["higher", "lower", "log"]:
-    """The better direction of a column of an evaluation: errors and rates are better lower, what is measured as drift
-    is best where it is nearest to the log's own, all others are better higher."""
+    """The better direction of a column of an evaluation: errors and rates are better lower, drift is best nearest to
+    the log's value, all remaining columns are better higher."""
     if source.endswith(("_error", "_rate")):
         return "lower"
     return "log" if source in Drift._fields else "higher"
@@ -20,10 +20,10 @@ def find_direction(source: str) -> Literal["higher", "lower", "log"]:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of an evaluation as tables show it."""
+    """A column of an evaluation with the heading and unit of tables."""
 
     source: str
-    """Its name in an `Evaluation`."""
+    """Name in an `Evaluation`."""
     heading: str
     meaning: str
     unit: Literal["", "m", "%", "m/s", "°"] = ""
@@ -32,14 +32,14 @@ class Column:
     """Heading where a rate is shown as a fraction; empty = the heading and the word rate."""
 
     @property
-    def better(self) -> str:
+    def direction_text(self) -> str:
         """The better direction in words."""
         direction = find_direction(self.source)
         return "best near the log's" if direction == "log" else f"{direction} is better"
 
     @property
     def label(self) -> str:
-        """Heading with the unit and, where there is one, an arrow in the better direction."""
+        """Heading with the unit, if any, and an arrow in the better direction."""
         return f"{self.heading}{f' [{self.unit}]' if self.unit else ''}{ARROWS[find_direction(self.source)]}"
 
     @property
@@ -94,7 +94,7 @@ _MISSES = (
 GOAL_COLUMNS = (*_MISSES, *SCORES[1:4], SCORES[0])
 """Shown in the table of goal conditioning, in the order of the paper's."""
 # The next three are on the command line only: reports and papers show neither.
-_LIGHT_ONE = Column(
+_WITHOUT_LIGHT = Column(
     "meta_metric_light_one", "RMM, light = 1", "realism meta-metric with the traffic light term set to 1"
 )
 _LEAVES_ROAD = Column(
@@ -102,7 +102,7 @@ _LEAVES_ROAD = Column(
     "evaluated agents that leave the road, of those whose log does not", "%", "leaves road",
 )  # fmt: skip
 _RED_LIGHT = Column("traffic_light_violation_rate", "red light", "evaluated agents that pass a red light", "%")
-TERMINAL_COLUMNS = (SCORES[0], _LIGHT_ONE, *SCORES[1:], _LEAVES_ROAD, _RED_LIGHT)
+TERMINAL_COLUMNS = (SCORES[0], _WITHOUT_LIGHT, *SCORES[1:], _LEAVES_ROAD, _RED_LIGHT)
 """Shown on the command line; rates as fractions."""
 TERMINAL_GOAL_COLUMNS = (*TERMINAL_COLUMNS, *_MISSES)
 """Shown on the command line where agents had goals."""
@@ -136,7 +136,7 @@ def format_number(value: float, digits: int) -> str:
     """A number with fixed digits and a real minus sign.
 
     Args:
-        value: in the unit that is shown.
-        digits: after the decimal point.
+        value: Number in the unit that is shown.
+        digits: Number of digits after the decimal point.
     """
     return f"{value:.{digits}f}".replace("-", "−")

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -20,7 +21,7 @@ FEW_CLUSTERS = 10
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """One column of two evaluations on the same scenarios; the difference is b minus a."""
+    """A column of two evaluations on the same scenarios; the difference is b minus a."""
 
     column: str
     count: int
@@ -77,7 +78,7 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two evaluations, scenario by scenario; `comparison["meta_metric"]` is the difference of one column."""
+    """Two evaluations, scenario by scenario; `comparison["meta_metric"]` is the difference of a column."""
 
     name_a: str
     name_b: str
@@ -94,10 +95,10 @@ class Comparison:
         return f"{self.name_b} against {self.name_a}, {self.pairing}; {self['meta_metric']!r}"
 
     def __getitem__(self, column: str) -> PairedDifference:
-        """Difference of one column.
+        """Difference of a column.
 
         Raises:
-            ConfigError: there is no such column.
+            ConfigError: A column that no evaluation has.
         """
         column = LABELS.get(column, column)
         for difference in self.differences:
@@ -116,7 +117,7 @@ class Comparison:
 
     @property
     def caution(self) -> str:
-        """A sentence on intervals that few clusters make uncertain; empty where there are enough, or none."""
+        """A sentence on intervals that few clusters make uncertain; empty with enough clusters, or without any."""
         if not 0 < self.num_clusters < FEW_CLUSTERS:
             return ""
         return (
@@ -129,17 +130,17 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     """Paired comparison, b against a.
 
     Args:
-        a: the reference, e.g. the base model.
-        b: the other one, e.g. the fine-tuned model.
-        alpha: probability of calling a difference that is none.
+        a: Reference, e.g. the base model.
+        b: Evaluation to judge, e.g. the fine-tuned model.
+        alpha: Probability of calling a difference that is none.
 
     Returns:
-        Differences with intervals and p-values. Where scenarios share street networks or recordings, these are what
-        counts (`cluster_bootstrap`); else each scenario does (Student's t).
+        Differences with intervals and p-values. Where scenarios share street networks or recordings, these are counted
+        (`cluster_bootstrap`); else the scenarios (Student's t).
 
     Raises:
-        ConfigError: alpha is no probability.
-        DataError: other metric or number of rollouts, or no scenario in common.
+        ConfigError: An alpha that is no probability.
+        DataError: Unequal metrics or numbers of rollouts, or no scenario in common.
     """
     if not 0 < alpha < 1:
         raise ConfigError(f"alpha must lie between 0 and 1, got {alpha}: 0.05 is usual.")
@@ -154,23 +155,11 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     rows_a, rows_b = pair_rows(a, b)
     clusters = a.clusters[rows_a]
     num_clusters = len(set(clusters)) if len(set(clusters)) < len(rows_a) else 0
+    compare_values = partial(compare_paired, alpha=alpha, clusters=clusters if num_clusters else None)
+    differences = tuple(compare_values(c, a.values(c)[rows_a], b.values(c)[rows_b]) for c in SCORE_COLUMNS)
+    num_paired = len(rows_a)
     return Comparison(
-        name_a=a.name,
-        name_b=b.name,
-        num_paired=len(rows_a),
-        num_only_a=len(a) - len(rows_a),
-        num_only_b=len(b) - len(rows_b),
-        differences=tuple(
-            compare_paired(
-                column,
-                a.values(column)[rows_a],
-                b.values(column)[rows_b],
-                alpha=alpha,
-                clusters=clusters if num_clusters else None,
-            )
-            for column in SCORE_COLUMNS
-        ),
-        num_clusters=num_clusters,
+        a.name, b.name, num_paired, len(a) - num_paired, len(b) - num_paired, differences, num_clusters=num_clusters
     )
 
 
@@ -178,11 +167,11 @@ def pair_rows(a: Evaluation, b: Evaluation) -> tuple[list[int], list[int]]:
     """Rows of the scenarios that both have, in the order of the first.
 
     Args:
-        a: an evaluation.
-        b: another one.
+        a: Evaluation that gives the order of the pairs.
+        b: Evaluation that is paired with `a`.
 
     Raises:
-        DataError: they have none in common, or one of them has several rows of a scenario.
+        DataError: No scenario in common, or an evaluation with several rows of a scenario.
     """
     # scored files may hold several sets of rollouts of a scenario: nothing says which of them make a pair
     for evaluation in (a, b):
@@ -191,24 +180,24 @@ def pair_rows(a: Evaluation, b: Evaluation) -> tuple[list[int], list[int]]:
             raise DataError(
                 f"{evaluation.name}: scenario {repeated[0]} has several rows, a pair needs one: score its sets apart."
             )
-    place = {scenario_id: row for row, scenario_id in enumerate(b.scenario_ids)}
-    rows_a = [row for row, scenario_id in enumerate(a.scenario_ids) if scenario_id in place]
+    rows_by_id = {scenario_id: row for row, scenario_id in enumerate(b.scenario_ids)}
+    rows_a = [row for row, scenario_id in enumerate(a.scenario_ids) if scenario_id in rows_by_id]
     if not rows_a:
         raise DataError(f"{a.name} ({len(a)} scenarios) and {b.name} ({len(b)}) have no scenario in common.")
-    return rows_a, [place[a.scenario_ids[row]] for row in rows_a]
+    return rows_a, [rows_by_id[a.scenario_ids[row]] for row in rows_a]
 
 
 def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Ids of the scenarios that both have, and both columns [scenarios] there.
 
     Args:
-        a: an evaluation.
-        b: another one.
-        column: one of `SCORE_COLUMNS`.
+        a: Evaluation that gives the order of the pairs.
+        b: Evaluation that is paired with `a`.
+        column: Name in `SCORE_COLUMNS`.
 
     Raises:
-        DataError: they have none in common.
-        ConfigError: there is no such column.
+        DataError: No scenario in common.
+        ConfigError: A column that no evaluation has.
     """
     rows_a, rows_b = pair_rows(a, b)
     return [a.scenario_ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
@@ -225,21 +214,21 @@ def compare_paired(
     """Paired t-test of two columns; scenarios without a value in both are left out.
 
     Args:
-        column: their name.
-        a: the reference's values.
-        b: the other one's, of the same scenarios in the same order.
-        alpha: probability of calling a difference that is none.
+        column: Name of both columns, for the result.
+        a: Values of the reference; NaN = no value.
+        b: Values to judge, of the same scenarios in the same order.
+        alpha: Probability of calling a difference that is none.
         clusters: Street network or recording of each scenario, by which interval and p-value then count; needed for
             values of several runs. None = each scenario stands for itself.
     """
-    in_both = np.isfinite(a) & np.isfinite(b)
+    is_paired = np.isfinite(a) & np.isfinite(b)
     # a paired t-test is a t-test of the differences: scenarios differ far more than policies do
     if clusters is None:
-        gain, num_clusters = mean_interval((b - a)[in_both], alpha=alpha), 0
+        gain, num_clusters = mean_interval((b - a)[is_paired], alpha=alpha), 0
     else:
-        gain = cluster_bootstrap(np.where(in_both, b - a, np.nan), clusters, level=1 - alpha)
-        num_clusters = len(set(clusters[np.atleast_2d(in_both).any(0)]))
-    means = (float(a[in_both].mean()), float(b[in_both].mean())) if gain.count else (math.nan, math.nan)
+        gain = cluster_bootstrap(np.where(is_paired, b - a, np.nan), clusters, level=1 - alpha)
+        num_clusters = len(set(clusters[np.atleast_2d(is_paired).any(0)]))
+    means = (float(a[is_paired].mean()), float(b[is_paired].mean())) if gain.count else (math.nan, math.nan)
     return PairedDifference(
         column, gain.count, *means, gain.mean, gain.standard_error, gain.interval, gain.p_value, alpha, num_clusters
     )
@@ -252,18 +241,17 @@ def select_columns(*evaluations: Evaluation) -> tuple[Column, ...]:
 
 
 def _with_rmm(count: int, num_scenarios: int) -> str:
-    """Note on the scenarios that the mean meta-metric is over, where it is undefined for some."""
+    """Note on the scenarios that the mean meta-metric is over, if undefined for some."""
     return f" ({count} with RMM)" if count < num_scenarios else ""
 
 
-def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = None) -> Table:
-    """One row per evaluation: mean ± standard error over its scenarios. Arrows point in the better direction.
+def format_table(*evaluations: Evaluation) -> Table:
+    """A row per evaluation: mean ± standard error over the scenarios. Arrows point in the better direction.
 
     Args:
-        evaluations: the rows.
-        columns: None = `select_columns` the evaluations.
+        evaluations: Evaluations in the order of the rows; `select_columns` chooses the columns.
     """
-    columns = columns or select_columns(*evaluations)
+    columns = select_columns(*evaluations)
     with_goals = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
     notes = list(dict.fromkeys(evaluation.data_note for evaluation in evaluations))
     if with_goals:
@@ -278,18 +266,18 @@ def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = No
         table.add_column(column.fraction_label, justify="right")
     for evaluation in evaluations:
         means = [evaluation.mean_and_error(column.source) for column in columns]
-        cells = [_plus_minus(found.mean, found.standard_error) for found in means]
+        cells = [_plus_minus(mean.mean, mean.standard_error) for mean in means]
         num_scenarios = len(evaluation)
         table.add_row(evaluation.name, f"{num_scenarios}{_with_rmm(evaluation.num_with_rmm, num_scenarios)}", *cells)
     return table
 
 
 def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TERMINAL_COLUMNS) -> Table:
-    """One row per column: both means, the difference ± standard error and the verdict.
+    """A row per column: both means, the difference ± standard error and the verdict.
 
     Args:
-        comparison: of two evaluations.
-        columns: the rows.
+        comparison: Paired comparison of two evaluations.
+        columns: Columns of evaluations, in the order of the rows.
     """
     table = Table(
         title=f"{comparison.name_b} against {comparison.name_a}: {comparison.pairing}",

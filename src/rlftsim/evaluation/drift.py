@@ -1,7 +1,7 @@
 """Departure of simulated traffic from the log in ways that drivers would name: speed, stops, lanes, contacts.
 
 The meta-metric rewards slow traffic, which hits nothing and stays on the road. These numbers, reported beside it, show
-at what price a score was reached. They are means over evaluated agents and rollouts of one scenario.
+at what price a score was reached: means over evaluated agents and rollouts of a scenario.
 """
 
 import math
@@ -60,19 +60,19 @@ class Drift(NamedTuple):
 
 
 def measure_drift(scenario: Scenario, states: SimulatedStates) -> Drift:
-    """Drift of one scenario's rollouts; those of the log itself show what a perfect model has.
+    """Drift of a scenario's rollouts; the drift of the log shows the numbers of a perfect model.
 
     Args:
-        scenario: with its future.
-        states: its rollouts; repeated ones count once, which changes no mean.
+        scenario: Scenario with the logged future.
+        states: Rollouts of the scenario; repeated rollouts count once, which changes no mean.
     """
     # 1. Agents in the order of the scenario's tracks, from the current step on.
     tracks, everyone = scenario.tracks, scenario.simulated_indices
     order = np.argsort(states.object_id)
     rows = order[np.searchsorted(states.object_id[order], tracks.object_id[everyone])]
     x, y, angle = (v.cpu().numpy()[:, rows].astype(np.float64) for v in (states.x, states.y, states.heading))
-    now = np.broadcast_to(tracks.position[everyone, CURRENT_STEP, :2], (len(x), len(everyone), 2))  # [N, A, 2]
-    position = np.concatenate([now[:, :, None], np.stack([x, y], -1)], 2)  # [N, A, 81, 2]
+    start = np.broadcast_to(tracks.position[everyone, CURRENT_STEP, :2], (len(x), len(everyone), 2))  # [N, A, 2]
+    position = np.concatenate([start[:, :, None], np.stack([x, y], -1)], 2)  # [N, A, 81, 2]
     velocity = np.diff(position, axis=2) / STEP_S  # [N, A, 80, 2]
     evaluated = np.flatnonzero(np.isin(everyone, scenario.evaluated_indices))  # [E], places among all simulated agents
     # 2. Speeds at the steps at which the log has one.
@@ -83,7 +83,7 @@ def measure_drift(scenario: Scenario, states: SimulatedStates) -> Drift:
     speed = np.linalg.norm(velocity, axis=-1)  # [N, A, 80]
     mean_logged = np.where(valid, logged, 0.0).sum(1) / np.maximum(valid.sum(1), 1)
     moving = mean_logged >= MOVING_M_S  # [A]
-    gap_all = _speed_gap(speed, logged, moving[:, None] & valid)
+    gap_simulated = _speed_gap(speed, logged, moving[:, None] & valid)
     valid, logged, speed, moving = valid[evaluated], logged[evaluated], speed[:, evaluated], moving[evaluated]
     tracked = everyone[evaluated]
     counted = speed[:, moving[:, None] & valid]  # [N, moving steps]
@@ -94,13 +94,13 @@ def measure_drift(scenario: Scenario, states: SimulatedStates) -> Drift:
     stops = _stops(speed[:, never_stops], valid[never_stops])  # [N, agents]
     offset, turned = _measure_lanes(scenario, position[:, evaluated, 1:], angle[:, evaluated], tracked)
     contact = _contact_speed(scenario, position[:, :, 1:], angle, velocity, everyone, evaluated)
-    return Drift(gap, gap_all, slow, median, fast, _mean(stops), *offset, *turned, contact)
+    return Drift(gap, gap_simulated, slow, median, fast, _mean(stops), *offset, *turned, contact)
 
 
 def _speed_gap(
     speed: Float[np.ndarray, "N A T"], logged: Float[np.ndarray, "A T"], counted: Bool[np.ndarray, "A T"]
 ) -> float:
-    """Mean speed minus the mean logged one at the steps that are counted."""
+    """Mean speed minus the mean logged speed at the steps that are counted."""
     return float(speed[:, counted].mean() - logged[counted].mean()) if counted.any() else math.nan
 
 
@@ -126,7 +126,7 @@ class _LanePoints(NamedTuple):
 @cached_on_scenario
 def _lane_points(scenario: Scenario) -> _LanePoints | None:
     """None where the map has no lane."""
-    parts = []
+    lines = []
     for line in lane_graph(scenario).lines:
         points = densify(line[:, :2], LANE_SPACING_M)
         tangent = np.gradient(points, axis=0)
@@ -134,10 +134,10 @@ def _lane_points(scenario: Scenario) -> _LanePoints | None:
         step = np.maximum(np.linalg.norm(tangent, axis=-1), 1e-6)
         # A polyline turns at its corners alone: its curvature is that over some meters to both sides.
         turn = np.abs(np.gradient(np.convolve(np.pad(heading, 3, mode="edge"), np.full(7, 1 / 7), "valid")))
-        parts.append((points, heading, turn / step > 1 / STRAIGHT_RADIUS_M))
-    if not parts:
+        lines.append((points, heading, turn / step > 1 / STRAIGHT_RADIUS_M))
+    if not lines:
         return None
-    position, heading, curved = (np.concatenate(part) for part in zip(*parts))
+    position, heading, curved = (np.concatenate(arrays) for arrays in zip(*lines))
     return _LanePoints(KDTree(position), position, heading, curved)
 
 
@@ -147,24 +147,24 @@ def _measure_lanes(
     angle: Float[np.ndarray, "N E T"],
     tracked: Int[np.ndarray, "E"],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Mean offset from the lane center, m, and mean angle to it, rad; each on straight and on curved lanes."""
+    """Mean offset from the lane center, m, and mean angle to the lane, rad; each on straight and on curved lanes."""
     lanes = _lane_points(scenario)
     vehicles = scenario.tracks.object_type[tracked] == ObjectType.VEHICLE
     if lanes is None or not vehicles.any():
         return (float("nan"), float("nan")), (float("nan"), float("nan"))
-    place = position[:, vehicles, LANE_STEPS - 1 :: LANE_STEPS].reshape(-1, 2)  # [P, 2]
+    points = position[:, vehicles, LANE_STEPS - 1 :: LANE_STEPS].reshape(-1, 2)  # [P, 2]
     heading = angle[:, vehicles, LANE_STEPS - 1 :: LANE_STEPS].reshape(-1)
     # Of the points in reach the nearest along whose lane the vehicle drives: crossings lie on top of each other.
-    distance, index = lanes.tree.query(place, k=16, distance_upper_bound=LANE_REACH_M)  # [P, 16]
+    distance, index = lanes.tree.query(points, k=16, distance_upper_bound=LANE_REACH_M)  # [P, 16]
     index = np.minimum(index, len(lanes.heading) - 1)  # missing neighbors have an infinite distance
     turned = np.abs(wrapped(heading[:, None] - lanes.heading[index]))
     first = np.where(turned <= LANE_HEADING, distance, np.inf).argmin(1)[:, None]
     nearest, error = (np.take_along_axis(v, first, 1)[:, 0] for v in (index, turned))
-    found = np.isfinite(np.take_along_axis(distance, first, 1)[:, 0]) & (error <= LANE_HEADING)
-    along = lanes.heading[nearest]
-    away = place - lanes.position[nearest]
-    offset = np.abs(np.cos(along) * away[:, 1] - np.sin(along) * away[:, 0])  # across the lane
-    straight, curved = found & ~lanes.curved[nearest], found & lanes.curved[nearest]
+    is_in_lane = np.isfinite(np.take_along_axis(distance, first, 1)[:, 0]) & (error <= LANE_HEADING)
+    lane_heading = lanes.heading[nearest]
+    gap = points - lanes.position[nearest]
+    offset = np.abs(np.cos(lane_heading) * gap[:, 1] - np.sin(lane_heading) * gap[:, 0])  # across the lane
+    straight, curved = is_in_lane & ~lanes.curved[nearest], is_in_lane & lanes.curved[nearest]
     return (_mean(offset[straight]), _mean(offset[curved])), (_mean(error[straight]), _mean(error[curved]))
 
 
@@ -176,7 +176,7 @@ def _contact_speed(
     everyone: Int[np.ndarray, "A"],
     evaluated: Int[np.ndarray, "E"],
 ) -> float:
-    """Mean relative speed at the first contact of evaluated agents with any other, m/s."""
+    """Mean relative speed at the first contact of evaluated agents with any agent, m/s."""
     size = scenario.tracks.size[everyone, CURRENT_STEP, :2].astype(np.float64)  # [A, 2], length and width
     reach = np.linalg.norm(size, axis=-1) / 2
     # In the log an agent that is lost stands at the origin, and comes back at once: it did not drive there.
@@ -184,15 +184,16 @@ def _contact_speed(
     speeds = []
     for agent in evaluated:
         gap = position - position[:, agent, None]  # [N, A, T, 2]
-        near = (gap**2).sum(-1) < (reach + reach[agent])[:, None] ** 2
-        near[:, agent] = False
-        near &= drove & drove[:, agent, None]
-        rollout, other, step = near.nonzero()
-        hit = boxes_overlap(gap[near], angle[rollout, agent, step], angle[near], size[agent], size[other])
-        rollout, other, step = rollout[hit], other[hit], step[hit]
+        is_candidate = (gap**2).sum(-1) < (reach + reach[agent])[:, None] ** 2
+        is_candidate[:, agent] = False
+        is_candidate &= drove & drove[:, agent, None]
+        rollout, partner, step = is_candidate.nonzero()
+        partner_angle = angle[is_candidate]
+        hit = boxes_overlap(gap[is_candidate], angle[rollout, agent, step], partner_angle, size[agent], size[partner])
+        rollout, partner, step = rollout[hit], partner[hit], step[hit]
         # The first contact of each rollout: pairs sorted by step, then the first of every rollout.
         order = np.lexsort((step, rollout))
         first = order[np.unique(rollout[order], return_index=True)[1]]
-        closing = velocity[rollout, agent, step] - velocity[rollout, other, step]
+        closing = velocity[rollout, agent, step] - velocity[rollout, partner, step]
         speeds.append(np.linalg.norm(closing[first], axis=-1))
     return _mean(np.concatenate([np.zeros(0), *speeds]))

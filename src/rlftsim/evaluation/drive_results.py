@@ -1,7 +1,7 @@
-"""Results of `rlftsim drive`: one row per scenario, for one planner in one kind of traffic, in one Parquet file."""
+"""Results of `rlftsim drive`: a Parquet file with a row per scenario, for a planner in a type of traffic."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,16 +12,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.table import Table
 
-from rlftsim.errors import DataError, check_types
+from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
+from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import read_parquet, read_parquet_metadata
 from rlftsim.statistics import mean_interval
 
 FORMAT = "rlftsim-drive-1"
-SHOWN = (
+MAIN_SCORES = (
     "nuplan_style", "pdms_style", "no_at_fault_collision", "drivable_area", "progress", "time_to_collision", "comfort",
     "at_fault_collision_rate", "hit_rate", "others_realism", "others_collision_rate", "others_offroad_rate",
 )  # fmt: skip
@@ -46,10 +47,10 @@ class DriveSettings:
     planner_code: str = ""
     """Hash of the file that defines the planner."""
     manifest_sha256: str = ""
-    """Of the data set."""
+    """Hash of the data set's manifest."""
 
     def what_counts(self) -> dict[str, object]:
-        """The values that results of the same episodes share. The data set may move: its manifest identifies it."""
+        """The values that results of the same episodes share; the manifest identifies a data set that was moved."""
         values = asdict(self)
         if self.manifest_sha256:
             del values["dataset"]
@@ -58,7 +59,7 @@ class DriveSettings:
 
 @dataclass(frozen=True, eq=False)
 class DriveResult:
-    """Scores of one planner in one kind of traffic, means over the rollouts of each scenario."""
+    """Scores of a planner in a type of traffic, means over the rollouts of each scenario."""
 
     settings: DriveSettings
     table: pa.Table
@@ -73,11 +74,13 @@ class DriveResult:
         """Result of some rows.
 
         Args:
-            settings: of the episodes.
-            rows: with the same columns.
-            missing: scores that some scenarios cannot give.
+            settings: Planner, traffic, data and seed of the episodes.
+            rows: A row per scenario, all with the same columns.
+            missing: Reasons for missing scores, by scenario id and score.
         """
-        return cls(settings, pa.Table.from_pylist(list(rows)), {name: why for name, why in missing.items() if why})
+        return cls(
+            settings, pa.Table.from_pylist(list(rows)), {name: reasons for name, reasons in missing.items() if reasons}
+        )
 
     @property
     def name(self) -> str:
@@ -86,7 +89,7 @@ class DriveResult:
 
     @property
     def scenario_ids(self) -> list[str]:
-        """Ids of its scenarios."""
+        """Ids of the scenarios, in the order of the rows."""
         return self.table["scenario_id"].to_pylist()
 
     def values(self, column: str) -> np.ndarray:
@@ -104,7 +107,7 @@ class DriveResult:
         """Read the file that `write` wrote.
 
         Raises:
-            DataError: not such a file, or one that was cut or edited.
+            DataError: Not such a file, or a file that was cut or edited.
         """
         way_out = "not a result of `rlftsim drive`, drive again"
         try:
@@ -119,7 +122,7 @@ class DriveResult:
             settings = DriveSettings(**about["settings"])
             check_types(settings)
             missing = {name: dict(reasons.items()) for name, reasons in about["missing"].items()}
-            if not all(isinstance(why, str) for reasons in missing.values() for why in reasons.values()):
+            if not all(isinstance(text, str) for reasons in missing.values() for text in reasons.values()):
                 raise TypeError("a reason is no text")
             _check_columns(table)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -133,28 +136,28 @@ class DriveResult:
 
 
 def _check_columns(table: pa.Table) -> None:
-    """Require what tables and comparisons read: a text for each scenario, and numbers.
+    """Check the columns that tables and comparisons read: a text for each scenario, and numbers.
 
     Raises:
-        KeyError: a column is missing.
-        TypeError: one has other values.
-        ValueError: a scenario is there twice, or a number is infinite.
+        KeyError: A missing column.
+        TypeError: A column of values of a wrong type.
+        ValueError: A scenario that is listed twice, or an impossible number.
     """
-    for name in (*TEXTS, *SHOWN):
+    for name in (*TEXTS, *MAIN_SCORES):
         if name not in table.schema.names:
             raise KeyError(f"column {name}")
     for name, column in zip(table.schema.names, table.columns):
         if column.type != (pa.string() if name in TEXTS else pa.float64()) or column.null_count:
             raise TypeError(f"column {name} has empty cells or those of another type")
-        if name not in TEXTS and np.isinf(column.to_numpy()).any():
-            raise ValueError(f"column {name} has an infinite number")
+        if name not in TEXTS and (np.abs(column.to_numpy()) > LARGEST).any():
+            raise ValueError(f"column {name} has a number beyond {LARGEST:g}")
     ids = table["scenario_id"].to_pylist()
     if len({*ids}) < len(ids):
         raise ValueError("a scenario is there twice")
 
 
 def is_drive_result(path: str | PathLike[str]) -> bool:
-    """True for a Parquet file of `rlftsim drive`; False for anything else, also for no file."""
+    """True for a Parquet file of `rlftsim drive`; False for any other file, and without a file."""
     metadata = read_parquet_metadata(path).get(b"rlftsim", b"{}")
     try:
         return parse_json(metadata, "drive again", source=str(path)).get("format") == FORMAT
@@ -162,42 +165,67 @@ def is_drive_result(path: str | PathLike[str]) -> bool:
         return False
 
 
-def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tuple[PairedDifference, ...]:
+@dataclass(frozen=True, eq=False)
+class DriveComparison:
+    """Two results, scenario by scenario; `comparison["progress"]` is the difference of a score."""
+
+    a: DriveResult
+    b: DriveResult
+    differences: tuple[PairedDifference, ...]
+    """Of the scores that both have, b minus a."""
+
+    def __iter__(self) -> Iterator[PairedDifference]:
+        return iter(self.differences)
+
+    def __getitem__(self, column: str) -> PairedDifference:
+        """Difference of a score.
+
+        Raises:
+            ConfigError: A score that is not in both.
+        """
+        for difference in self.differences:
+            if difference.column == column:
+                return difference
+        raise ConfigError(f"both have no score {column!r}, only {', '.join(row.column for row in self.differences)}.")
+
+
+def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> DriveComparison:
     """Paired differences of the scores that both have, b minus a.
 
     Args:
-        a: the reference, such as a planner in replayed traffic.
-        b: the other one, such as the same planner in reactive traffic.
-        alpha: probability of calling a difference that is none.
+        a: Reference, such as a planner in replayed traffic.
+        b: Result to judge, such as the same planner in reactive traffic.
+        alpha: Probability of calling a difference that is none.
 
     Raises:
-        DataError: other numbers of rollouts, seeds or data, or no scenario in common.
+        DataError: Unequal numbers of rollouts, seeds or data, or no scenario in common.
     """
     # a data set may have moved, or be another one at the same place; older results know its place alone
     know_content = a.settings.manifest_sha256 and b.settings.manifest_sha256
     compared = {name: name for name in ("num_rollouts", "seed", "split")}
     compared["dataset"] = "manifest_sha256" if know_content else "dataset"
-    for shown, setting in compared.items():
+    for label, setting in compared.items():
         if getattr(a.settings, setting) != getattr(b.settings, setting):
-            own, other = getattr(a.settings, shown), getattr(b.settings, shown)
-            other = f"another {other}" if own == other else other
-            raise DataError(f"{a.name} was driven with {shown} {own}, {b.name} with {other}: drive both alike.")
-    place = {name: row for row, name in enumerate(b.table["scenario_id"].to_pylist())}
-    rows_a = [row for row, name in enumerate(a.table["scenario_id"].to_pylist()) if name in place]
-    rows_b = [place[a.table["scenario_id"][row].as_py()] for row in rows_a]
+            value_a, value_b = getattr(a.settings, label), getattr(b.settings, label)
+            value_b = f"another {value_b}" if value_a == value_b else value_b
+            raise DataError(f"{a.name} was driven with {label} {value_a}, {b.name} with {value_b}: drive both alike.")
+    rows_by_id = {name: row for row, name in enumerate(b.scenario_ids)}
+    rows_a = [row for row, name in enumerate(a.scenario_ids) if name in rows_by_id]
+    rows_b = [rows_by_id[name] for name in a.scenario_ids if name in rows_by_id]
     if not rows_a:
         raise DataError(f"{a.name} and {b.name} have no scenario in common.")
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
-    return tuple(compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
+    rows = (compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
+    return DriveComparison(a, b, tuple(rows))
 
 
 def format_drives(*results: DriveResult) -> Table:
-    """One column per result: mean ± standard error over its scenarios."""
+    """A column per result: mean ± standard error over the scenarios."""
     table = Table()
     table.add_column("", no_wrap=True)
     for result in results:
         table.add_column(f"{result.name} ({len(result.table)} scenarios)", justify="right")
-    for name in SHOWN:
+    for name in MAIN_SCORES:
         means = [mean_interval(result.values(name)) for result in results]
         cells = [
             "–" if not mean.count else f"{format_number(mean.mean, 4)}"
@@ -208,14 +236,9 @@ def format_drives(*results: DriveResult) -> Table:
     return table
 
 
-def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> Table:
-    """One row per score: both means and the verdict.
-
-    Args:
-        a: the reference.
-        b: the other one.
-        alpha: probability of calling a difference that is none.
-    """
+def format_drive_comparison(comparison: DriveComparison) -> Table:
+    """A row per score: both means and the verdict."""
+    a, b = comparison.a, comparison.b
     models = {a.settings.model, b.settings.model} - {"none"}
     note = ", whose traffic models differ" if len(models) > 1 else ""
     table = Table(title=f"{b.name} against {a.name}{note}", title_justify="left")
@@ -223,8 +246,8 @@ def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> 
     for name in (a.name, b.name):
         table.add_column(name, justify="right")
     table.add_column("verdict")
-    for row in compare_drives(a, b, alpha=alpha):
-        if row.column in SHOWN and row.count:
+    for row in comparison:
+        if row.column in MAIN_SCORES and row.count:
             label = f"{row.column} {ARROWS[find_direction(row.column)]}"
             table.add_row(label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", row.verdict)
     return table

@@ -1,4 +1,4 @@
-"""Scores of a policy on a data set: simulate every scenario, score all its rollouts together, keep the numbers of each.
+"""Scores of a policy on a data set: simulate every scenario, score all rollouts together, keep a row per scenario.
 
 An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
 """
@@ -6,7 +6,7 @@ An interrupted evaluation is resumed by the same call, see `evaluation.resumable
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -16,15 +16,7 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError, DataError, whole_number
-from rlftsim.evaluation.results import (
-    NUMBERS_VERSION,
-    EvaluateConfig,
-    Evaluation,
-    GoalsGiven,
-    Provenance,
-    Skipped,
-    row_of_result,
-)
+from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
@@ -39,17 +31,6 @@ from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-
-__all__ = [
-    "EvaluateConfig",
-    "Evaluation",
-    "GoalsGiven",
-    "Provenance",
-    "Skipped",
-    "evaluate",
-    "evaluation_name",
-    "simulate_states",
-]
 
 Oracle = Literal["oracle"]
 AnyPolicy = TypeVar("AnyPolicy")
@@ -67,7 +48,7 @@ def evaluate(
 ) -> Evaluation:
     """Score a policy on the scenarios of a data set; the result is also written to `out/<name>.parquet`.
 
-    Interrupted in any way, the same call goes on; once finished, it reads the result.
+    Interrupted in any way, the same call goes on; a finished result is read.
 
     Args:
         policy: Any policy, or "oracle" for the log.
@@ -110,7 +91,7 @@ def evaluate(
     return resume_evaluation(
         f"evaluate {name}",
         dataset.scenario_ids[: len(positions)],
-        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
+        partial(_evaluate_scenario, frozen, dataset, config),
         name=name,
         provenance=provenance,
         out=None if out is None else validate_folder(out),
@@ -120,23 +101,23 @@ def evaluate(
 
 
 def evaluation_name(model: str | PathLike[str]) -> str:
-    """Name of an evaluation of a model: that of its folder, or of its run, as a run's model lies in RUN/model."""
+    """Name of an evaluation of a model: name of the folder, or of the run for a model in RUN/model."""
     path = Path(model)
     return path.parent.name if path.name == "model" else path.name
 
 
 def frozen_copy(policy: AnyPolicy) -> AnyPolicy:
-    """A copy without dropout and gradients, so that a policy may keep parts of it in tables; itself without weights."""
+    """A copy without dropout and gradients, so that tables of weights stay valid; the policy if without weights."""
     return copy.deepcopy(policy).eval().requires_grad_(False) if isinstance(policy, nn.Module) else policy
 
 
 def evaluated_ends(batch: ScenarioBatch) -> Goals:
-    """Logged final positions of the evaluated agents, as their goals."""
+    """Logged final positions of the evaluated agents, as goals."""
     return logged_goals(batch, batch.evaluated_mask)
 
 
 def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
-    """Plain values that a stored measurement must agree with to be this one, for `ScenarioValues`.
+    """Plain values that identify a measurement, for the comparison with stored files of `ScenarioValues`.
 
     Args:
         policy: Policy that is measured; weights and settings count.
@@ -160,7 +141,7 @@ def check_jobs(jobs: int, device: torch.device, setting: str = "evaluate.jobs") 
         setting: Name of the setting, for messages.
 
     Raises:
-        ConfigError: No process, or several and another device.
+        ConfigError: No process, or several processes and a GPU.
     """
     whole_number(setting, jobs, 1)
     if jobs > 1 and device.type != "cpu":
@@ -177,13 +158,13 @@ def simulate_states(
     *,
     goals_of: Callable[[ScenarioBatch], Goals] | None = None,
 ) -> SimulatedStates:
-    """All rollouts of one scenario, simulated a few at a time; a deterministic policy is simulated once.
+    """All rollouts of a scenario, simulated a few at a time; a deterministic policy is simulated once.
 
     Args:
         policy: Policy of all agents.
         scenario: Logged scenario, simulated from the current step on.
         config: Number of rollouts, rollouts at a time, seed, sampling.
-        device: Device on which the policy is, and on which all is computed.
+        device: Device of the policy, for all computations.
         goals_of: Goals of the agents of a batch, the same in all rollouts; None = goal-free.
 
     Raises:
@@ -199,7 +180,7 @@ def simulate_states(
 def simulate_encoded(
     policy: Policy, batch: ScenarioBatch, context: Any, config: EvaluateConfig, *, goals: Goals | None = None
 ) -> SimulatedStates:
-    """All rollouts of one scenario that the policy has encoded, see `simulate_states`.
+    """All rollouts of a scenario that the policy has encoded, see `simulate_states`.
 
     Args:
         policy: Policy of all agents.
@@ -235,25 +216,18 @@ def simulate_encoded(
     return joined if is_random else replace(joined, repeat=config.num_rollouts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
-
-    policy: Policy | Oracle
-    dataset: ScenarioDataset
-    config: EvaluateConfig
-
-
-def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
-    """Row of one scenario, or why there is none."""
-    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
+def _evaluate_scenario(
+    policy: Policy | Oracle, dataset: ScenarioDataset, config: EvaluateConfig, position: int
+) -> dict[str, object] | Skipped:
+    """Row of a scenario, or the reason for a missing row."""
+    scenario, device = dataset[position], get_device(policy)
     try:
         scenario.check_consistency()
         scenario.check_finite_arrays()
     except DataError as error:
         # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
         raise DataError(
-            f"{job.dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
+            f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
             "such scenarios out."
         ) from None
     # Without a road edge, for instance, the official metric is undefined.
@@ -261,10 +235,10 @@ def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
         log = scenario_log(scenario, device)
     except DataError as error:
         return Skipped(scenario.scenario_id, str(error))
-    if isinstance(job.policy, str):
+    if isinstance(policy, str):
         states = logged_states(scenario, num_rollouts=config.num_rollouts, device=device)
     else:
         goals_of = evaluated_ends if config.goals == "logged" else None
-        states = simulate_states(job.policy, scenario, config, device, goals_of=goals_of)
+        states = simulate_states(policy, scenario, config, device, goals_of=goals_of)
     result = score(log, states, metric_by_name(config.metric))
-    return row_of_result(result, scenario, states, job.dataset.find_cluster(scenario.scenario_id))
+    return row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id))

@@ -1,7 +1,7 @@
 """Loss of a scenario's score against its ceiling, split over features, evaluated agents and future steps.
 
-The ceiling is the oracle: the log itself, repeated as often as there are rollouts. The loss is the meta-metric of the
-ceiling minus that of the rollouts; it is split without remainder, by the rule of `realism.credit`.
+The ceiling is the oracle: the log, repeated as often as there are rollouts. The loss, meta-metric of the ceiling minus
+meta-metric of the rollouts, is split without remainder, by the rule of `realism.credit`.
 """
 
 from dataclasses import dataclass
@@ -48,25 +48,25 @@ WHOLE_FUTURE = -1
 
 @dataclass(frozen=True, eq=False)
 class FeatureHistogram:
-    """One histogram feature of log and rollouts over the official bins, evaluated agents together."""
+    """A histogram feature of log and rollouts over the official bins, evaluated agents together."""
 
     feature: str
     edges: Float[np.ndarray, "K1"]
     log_fraction: Float[np.ndarray, "K"]
-    """Of the scored logged steps."""
+    """Fraction of the scored logged steps."""
     rollout_fraction: Float[np.ndarray, "K"]
-    """Of all steps of all rollouts, as the metric counts: steps without a value lie in the last bin."""
+    """Fraction of all steps of all rollouts, as the metric counts: steps without a value lie in the last bin."""
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A scenario's score, its ceiling and the costs between them."""
+    """A scenario's score, the ceiling and the costs between both."""
 
     scenario: Scenario
     config: MetricConfig
     result: RealismResult
     ceiling: RealismResult
-    """Of the oracle."""
+    """Scores of the oracle."""
     cost: Float[np.ndarray, "F E T1"]
     """Part of ceiling minus score that belongs to a feature, evaluated agent and future step; the last column is the
     whole future. Negative where the rollouts do better than the log."""
@@ -87,26 +87,24 @@ class Explanation:
 
     @property
     def agent_names(self) -> list[str]:
-        """Object id and kind of the evaluated agents."""
-        tracks, chosen = self.scenario.tracks, self.scenario.evaluated_indices
-        kinds = [ObjectType(int(kind)).name.lower() for kind in tracks.object_type[chosen]]
-        ego = self.scenario.ego_index
-        return [
-            f"{tracks.object_id[index]} {'ego' if index == ego else kind}"
-            for index, kind in zip(chosen.tolist(), kinds)
-        ]
+        """Object id and type of the evaluated agents."""
+        tracks, ego = self.scenario.tracks, self.scenario.ego_index
+        types = {
+            i: ObjectType(int(tracks.object_type[i])).name.lower() for i in self.scenario.evaluated_indices.tolist()
+        }
+        return [f"{tracks.object_id[i]} {'ego' if i == ego else name}" for i, name in types.items()]
 
 
 def explain(scenario: Scenario, states: SimulatedStates, config: MetricConfig = METRIC_2025) -> Explanation:
-    """Explain the score of one scenario's rollouts.
+    """Explanation of the score of a scenario's rollouts.
 
     Args:
-        scenario: with its logged future.
-        states: the rollouts, world frame.
-        config: metric.
+        scenario: Scenario with the logged future.
+        states: Rollouts of the scenario, world frame.
+        config: Metric of a year; features without a weight have no cost.
 
     Raises:
-        DataError: the scenario cannot be scored, or the agents are not its simulated ones.
+        DataError: A scenario that cannot be scored, or agents that are not the simulated agents of the scenario.
     """
     # 1. Features of log, rollouts and oracle; the oracle has as many rollouts, as the metric depends on their number.
     log = scenario_log(scenario)
@@ -124,7 +122,7 @@ def explain(scenario: Scenario, states: SimulatedStates, config: MetricConfig = 
         cost=cost.unflatten(-1, (len(log.agents.evaluated), -1)).numpy(),
         events=(events & log.agents.future_valid).numpy(),
         histograms=_histograms(log, features, config),
-        rollouts=motion_of(scenario, states).with_evaluated_flags(
+        rollouts=to_scene_motion(scenario, states).with_evaluated_flags(
             scenario, collision=features.collision, offroad=features.offroad
         ),
     )
@@ -135,12 +133,13 @@ def _mean_terms(log: ScenarioLog, features: Features, config: MetricConfig) -> F
     target, table = log_target(log, config), histogram_table(config, torch.device("cpu"))
     # Row 0 of the sets is that of all rollouts; in float64, so that the parts add up.
     sets, size = form_sets(count_rollouts(features, log, config), features.repeat)
-    whole = type(sets)(sets.bins[:1].double(), sets.agreement[:1].double(), sets.num_steps)
-    log_probability = compute_log_probabilities(whole.bins, size[:1].double() * whole.num_steps, table)[0]  # [H, E, K]
+    all_rollouts = type(sets)(sets.bins[:1].double(), sets.agreement[:1].double(), sets.num_steps)
+    num_samples = size[:1].double() * all_rollouts.num_steps
+    log_probability = compute_log_probabilities(all_rollouts.bins, num_samples, table)[0]  # [H, E, K]
     logged = stack_histogram_features(log.features)[:, 0]  # [H, E, T]
     steps = log_probability.gather(-1, find_bins(logged.flatten(1), table).view(logged.shape))  # [H, E, T]
     steps = torch.where(stack_scored_steps(log, config), steps, 0.0)
-    by_agent = compute_agent_log_likelihoods(whole, size[:1].double(), target, table)[0, len(steps) :]  # [J, E]
+    by_agent = compute_agent_log_likelihoods(all_rollouts, size[:1].double(), target, table)[0, len(steps) :]  # [J, E]
     # Histogram features fill the steps, Bernoulli features the last column: they have one value per future.
     terms = steps.new_zeros(len(FEATURE_NAMES), steps.shape[1], steps.shape[-1] + 1)  # [F, E, T + 1]
     terms[: len(steps), :, : steps.shape[-1]] = steps
@@ -152,24 +151,23 @@ def _histograms(log: ScenarioLog, features: Features, config: MetricConfig) -> t
     table, target = histogram_table(config, torch.device("cpu")), log_target(log, config)
     simulated = count_rollouts(features, log, config).bins.sum((0, 2))  # [H, K]
     logged = target.steps_in_bin.sum(1)  # [H, K]
-    found = []
+    histograms = []
     for row, (name, histogram) in enumerate(zip(HISTOGRAM_FEATURES, config.histograms)):
         # features have different numbers of bins: the rest of a row is padding
-        kept = slice(0, histogram.num_bins)
-        fractions = [counts[row, kept] / counts[row].sum().clamp(min=1) for counts in (logged, simulated)]
-        edges = table.edges[row, : histogram.num_bins + 1]
-        found.append(FeatureHistogram(name, edges.numpy(), *(fraction.numpy() for fraction in fractions)))
-    return tuple(found)
+        num_bins = histogram.num_bins
+        fractions = [counts[row, :num_bins] / counts[row].sum().clamp(min=1) for counts in (logged, simulated)]
+        edges = table.edges[row, : num_bins + 1]
+        histograms.append(FeatureHistogram(name, edges.numpy(), *(fraction.numpy() for fraction in fractions)))
+    return tuple(histograms)
 
 
-def motion_of(scenario: Scenario, states: SimulatedStates) -> SceneMotion:
+def to_scene_motion(scenario: Scenario, states: SimulatedStates) -> SceneMotion:
     """The rollouts after the logged history, in the map frame of the viewer."""
     ids = scenario.tracks.object_id[scenario.simulated_indices].astype(np.int64)
     order = torch.from_numpy(match_agents(ids, states.object_id, scenario.scenario_id))
     # float64: world coordinates may be large, the map frame is near the origin
-    future = torch.stack([states.x, states.y], -1)[:, order].double() - torch.from_numpy(
-        scenario.origin
-    )  # [N, A, T, 2]
+    future = torch.stack([states.x, states.y], -1)[:, order].double()  # [N, A, T, 2]
+    future -= torch.from_numpy(scenario.origin)
     log = logged_trajectories(scenario)
 
     def after_history(logged: np.ndarray, simulated: Tensor) -> np.ndarray:

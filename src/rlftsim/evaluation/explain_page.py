@@ -1,4 +1,4 @@
-"""Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms behind."""
+"""Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms."""
 
 import hashlib
 from collections.abc import Callable
@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim import __version__
+from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
-from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
 from rlftsim.jobs.files import remove_folder, write_text
 from rlftsim.jobs.folder import Lease, check_folder
@@ -32,14 +33,9 @@ MAX_STRIPS = 10
 """Rows of (feature, agent) drawn over time."""
 MAX_SHOWN_ROLLOUTS = 8
 _UNITS = {
-    "linear_speed": "m/s",
-    "linear_acceleration": "m/s²",
-    "angular_speed": "rad/s",
-    "angular_acceleration": "rad/s²",
-    "distance_to_nearest_object": "m",
-    "time_to_collision": "s",
-    "distance_to_road_edge": "m",
-}
+    "linear_speed": "m/s", "linear_acceleration": "m/s²", "angular_speed": "rad/s", "angular_acceleration": "rad/s²",
+    "distance_to_nearest_object": "m", "time_to_collision": "s", "distance_to_road_edge": "m",
+}  # fmt: skip
 _BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
 _CSS = """
 .results thead th.narrow { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }
@@ -73,7 +69,7 @@ def explain_rollouts(
     """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
 
     Further sets of rollouts of the same scenario are numbered: `<scenario id>-2.html`. Until all pages are there, the
-    finished ones lie in a folder of their own inside `out`: interrupted in any way, the same call goes on.
+    finished pages lie in a separate folder inside `out`: interrupted in any way, the same call goes on.
 
     Args:
         rollouts: Npz, submission file or a folder of either, see `find_rollouts`.
@@ -96,18 +92,30 @@ def explain_rollouts(
         name = entry.scenario_id.replace("/", "_") or "scenario"
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
         items[next(page for page in (f"{n}.html" for n in numbered) if page not in items)] = entry
-    identity = repr((hash_entries(entries), source.fingerprint, config.metric, config.missing_map, __version__))
+    identity = repr((hash_entries(entries), hash_source(source), config.metric, config.missing_map, __version__))
     pages = Path(out) / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
     runner = runner or choose_runner(config.num_jobs, len(items))
     with Lease(pages / ".lock", runner, "works in") as lease:
         finished = run_items(
-            "explain", list(items.items()), partial(_write_page, pages, source, config),
-            format=WholeFiles(pages, itemgetter(0)), lease=lease, runner=runner, show_progress=show_progress,
+            "explain", list(items.items()), partial(_write_page, pages, source, config), lease=lease, runner=runner,
+            format=WholeFiles(pages, itemgetter(0), _read_page), show_progress=show_progress,
         )  # fmt: skip
         written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
         lease.remove()
         remove_folder(pages, items)
     return written
+
+
+def _read_page(path: Path) -> str:
+    """Text of a page, empty where there is nothing to explain.
+
+    Raises:
+        DataError: The page is cut off.
+    """
+    html = path.read_text(encoding="utf-8", errors="replace")
+    if html and not html.endswith("</html>\n"):
+        raise DataError(f"{path}: its end is missing.")
+    return html
 
 
 def _write_page(
@@ -118,7 +126,7 @@ def _write_page(
     advance: Advance,
     is_stopped: Callable[[], bool],
 ) -> None:
-    """Write a page, empty where there is nothing to explain, unless the work is being stopped."""
+    """Write a page, empty for a scenario without a score, unless the work is being stopped."""
     if is_stopped():
         return
     name, entry = item
@@ -132,7 +140,7 @@ def _write_page(
 
 
 def explanation_html(explanation: Explanation) -> str:
-    """The whole page."""
+    """The page of an explanation as HTML."""
     name, result = explanation.scenario.scenario_id, explanation.result
     metric = escape(explanation.config.name)
     lead = (
@@ -300,7 +308,7 @@ def _table_html(head: str, rows: list[str]) -> str:
 
 
 def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:
-    """A cost, the redder the larger it is among others; green where it is a gain."""
+    """A cost, the redder the larger among all costs; green for a gain."""
     if not np.isfinite(value):
         return "<td>none scored</td>"
     heat = abs(value) / max(float(np.nanmax(np.abs(among))), 1e-12)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rlftsim.errors import ConfigError
-from rlftsim.evaluation.explain import motion_of
+from rlftsim.evaluation.explain import to_scene_motion
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import Scenario
@@ -32,31 +32,31 @@ MAX_ROLLOUTS = 8
 
 
 def exporter_by_name(name: str) -> Exporter:
-    """The exporter of a name, this package's or another's.
+    """The exporter of a name, from this or any installed package.
 
     Raises:
-        ConfigError: unknown, with the nearest known name, or not a function of three arguments.
+        ConfigError: An unknown name, with the nearest known name, or not a function of three arguments.
     """
-    found = EXPORTERS.get(name)
+    exporter = EXPORTERS.get(name)
     try:
-        inspect.signature(found).bind(None, None, None)
+        inspect.signature(exporter).bind(None, None, None)
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f"exporter {name!r} cannot be called ({error}): make it a function of scenario, rollouts and folder."
         ) from None
-    return found
+    return exporter
 
 
 def write_player(scenario: Scenario, states: SimulatedStates, folder: Path) -> Path:
     """Write FOLDER/SCENARIO.html, which plays the first rollouts beside the log in any browser.
 
     Args:
-        scenario: map and log.
-        states: its rollouts, world frame.
-        folder: of the page.
+        scenario: Scenario with the map and log that are drawn.
+        states: Rollouts of the scenario, world frame.
+        folder: Folder in which the page is written.
 
     Raises:
-        DataError: the file cannot be written.
+        DataError: A file that cannot be written.
     """
     path, animation = folder / f"{scenario.scenario_id}.html", _animation(scenario, states)
     write_page(path, animation.title, [animation])
@@ -67,12 +67,12 @@ def write_film(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pat
     """Write FOLDER/SCENARIO.mp4: the log beside the first rollouts, in real time.
 
     Args:
-        scenario: map and log.
-        states: its rollouts, world frame.
-        folder: of the film.
+        scenario: Scenario with the map and log that are drawn.
+        states: Rollouts of the scenario, world frame.
+        folder: Folder in which the film is written.
 
     Raises:
-        DataError: the file cannot be written.
+        DataError: A file that cannot be written.
     """
     path = folder / f"{scenario.scenario_id}.mp4"
     to_film(path, _animation(scenario, states))
@@ -84,6 +84,6 @@ def _animation(scenario: Scenario, states: SimulatedStates) -> Animation:
     scene = build_scene(scenario)
     panels = [
         Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents)),
-        Panel("rollouts", motion_of(scenario, states).first(MAX_ROLLOUTS).with_overlaps(scene.agents)),
+        Panel("rollouts", to_scene_motion(scenario, states).first(MAX_ROLLOUTS).with_overlaps(scene.agents)),
     ]
     return Animation(f"Scenario {scenario.scenario_id}", scene, panels)

@@ -1,6 +1,6 @@
-"""Attainment of goals that are given one at a time: the fraction of a policy's rollouts that come to each goal.
+"""Attainment of single goals: the fraction of a policy's rollouts that come to each goal.
 
-A file per scenario is kept, with the policy's fingerprint: an interrupted measurement is resumed, and another policy is
+A file per scenario is stored, with the policy's fingerprint: an interrupted measurement is resumed, and a new policy is
 measured anew. A policy that is not goal-conditioned is measured against the same goals, as a baseline.
 """
 
@@ -28,7 +28,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 
 @dataclass(frozen=True)
 class Attained:
-    """Attainment of one goal: fractions of the rollouts."""
+    """Attainment of a goal: fractions of the rollouts."""
 
     entry: GoalEntry
     reached: float
@@ -38,12 +38,12 @@ class Attained:
 
     @property
     def reached_once(self) -> float:
-        """1 if some rollout reaches it, else 0."""
+        """1 if any rollout reaches the goal, else 0."""
         return float(self.reached > 0)
 
     @property
     def passed_once(self) -> float:
-        """1 if some rollout passes it, else 0."""
+        """1 if any rollout passes the goal, else 0."""
         return float(self.passed > 0)
 
 
@@ -60,16 +60,16 @@ def attain_goals(
     """Attainment of each goal by a policy, in the order of the goals.
 
     Args:
-        policy: Any policy; one that is not goal-conditioned is simulated once for all goals of a scenario.
+        policy: Any policy; without goal conditioning, a scenario is simulated once for all goals.
         data: Folder of a data set, "synthetic", or an opened data set.
         out: Folder of the results, a JSON file per scenario, made if missing.
         config: Rollouts, seed, sampling, split, processes.
-        goals: Goals, each of which is pursued alone, whatever other goals the scenario has.
+        goals: Goals; each is pursued alone, whatever goals the scenario has besides.
         title: Name of the work, in front of the progress bar.
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: No such data set, scenario or agent, or another process at work in the folder.
+        DataError: No such data set, scenario or agent, or a second process at work in the folder.
         ConfigError: Several processes for a policy on a GPU.
     """
     dataset, config = open_held_out(data, config)
@@ -85,7 +85,7 @@ def attain_goals(
     }
     stored = measure_scenarios(
         title,
-        partial(_simulate_goals, _Job(frozen_copy(policy), dataset, config, by_scenario)),
+        partial(_simulate_goals, frozen_copy(policy), dataset, config, by_scenario),
         ScenarioValues(
             Path(out), tuple(by_scenario), identity, partial(_parse_attained, by_scenario),
             information={"package_version": __version__},
@@ -96,17 +96,6 @@ def attain_goals(
     # Files are by scenario, goals may come in any order.
     by_goal = {_key(attained.entry): attained for scenario_goals in stored for attained in scenario_goals}
     return tuple(by_goal[_key(goal)] for goal in goals)
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
-
-    policy: Policy
-    dataset: ScenarioDataset
-    config: EvaluateConfig
-    goals: Mapping[str, Sequence[GoalEntry]]
-    """By scenario id, in the order of positions."""
 
 
 def _key(entry: GoalEntry) -> tuple[str, int, float, float, str]:
@@ -120,17 +109,23 @@ def _parse_attained(
     return tuple(Attained(goal, reached, passed) for goal, reached, passed in fractions)
 
 
-def _simulate_goals(job: _Job, position: int) -> dict[str, object]:
-    """Fractions of the rollouts for each goal of a scenario."""
-    scenario_id = tuple(job.goals)[position]
-    batch = collate([job.dataset.by_id(scenario_id)]).to(get_device(job.policy))
+def _simulate_goals(
+    policy: Policy,
+    dataset: ScenarioDataset,
+    config: EvaluateConfig,
+    goals: Mapping[str, Sequence[GoalEntry]],
+    position: int,
+) -> dict[str, object]:
+    """Fractions of the rollouts for each goal of a scenario, with goals by scenario id in the order of positions."""
+    scenario_id = tuple(goals)[position]
+    batch = collate([dataset.by_id(scenario_id)]).to(get_device(policy))
     with torch.no_grad():
-        context = job.policy.encode(batch)
-    simulated = partial(simulate_encoded, job.policy, batch, context, job.config)
+        context = policy.encode(batch)
+    simulate = partial(simulate_encoded, policy, batch, context, config)
     # Without goal conditioning the rollouts are the same for every goal.
-    goal_free = None if is_goal_conditioned(job.policy) else simulated()
+    goal_free = None if is_goal_conditioned(policy) else simulate()
     outcomes = []
-    for goal in job.goals[scenario_id]:
-        states = goal_free or simulated(goals=goals_of_batch([goal], batch))
+    for goal in goals[scenario_id]:
+        states = goal_free or simulate(goals=goals_of_batch([goal], batch))
         outcomes.append(measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y)))
     return {"reached": [outcome.reached for outcome in outcomes], "passed": [outcome.passed for outcome in outcomes]}

@@ -1,4 +1,4 @@
-"""The metrics of a training run as charts, and as a picture in its folder."""
+"""The metrics of a training run as charts, and as a picture in the run folder."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from rlftsim.viewer.chart_picture import charts_to_png
 
 Lines = Sequence[Mapping[str, Any]]
 """Values of each update, see `read_metrics`."""
-NOT_DRAWN = ("update", "time", "seconds", "predictions", "learning_rate", "gradient_norm")
+UNDRAWN_METRICS = ("update", "time", "seconds", "predictions", "learning_rate", "gradient_norm")
 """Metrics of every imitation that say nothing about its objective."""
 
 
@@ -33,9 +33,9 @@ def write_learning_curve(run: Path) -> Path | None:
 
 
 def imitation_charts(lines: Lines) -> list[Chart]:
-    """Charts of pre-training and CAT-K: loss, accuracy and, where the model was validated, its realism.
+    """Charts of pre-training and CAT-K: loss, accuracy and, where the model was validated, realism.
 
-    A run with an objective of the policy's own has its loss and a chart for each further metric instead.
+    A run with an objective that the policy defines has the loss and a chart for each further metric instead.
     """
     realism = _chart(
         lines, "Realism of held-out rollouts", "RMM, mean and 95 % interval",
@@ -47,7 +47,7 @@ def imitation_charts(lines: Lines) -> list[Chart]:
             _chart(lines, "Next token right", "fraction", accuracy="first guess", top5_accuracy="among five"),
         ]
     else:
-        names = [name for name in lines[0] if name not in NOT_DRAWN and not name.startswith("validation_")]
+        names = [name for name in lines[0] if name not in UNDRAWN_METRICS and not name.startswith("validation_")]
         learned = [Chart(name.replace("_", " ").capitalize(), "update", name, [_curve(lines, name)]) for name in names]
     return [*learned, *([realism] if len(realism.curves[0].x) else [])]
 
@@ -56,8 +56,8 @@ def finetuning_charts(lines: Lines, kl_target: float | None = None) -> list[Char
     """Charts of fine-tuning with a reward: realism, reward, distance from the base model, KL penalty, violations.
 
     Args:
-        lines: values of each update.
-        kl_target: drawn as a dashed line, nats per decision; None = not drawn.
+        lines: Metrics of each update, see `read_metrics`.
+        kl_target: Target of the KL, a dashed line, in nats per decision; None = not drawn.
     """
     return [
         _chart(lines, "Realism of the training rollouts", "RMM", rmm="RMM"),
@@ -75,11 +75,11 @@ def finetuning_charts(lines: Lines, kl_target: float | None = None) -> list[Char
 
 
 def _chart(lines: Lines, title: str, label: str, *, reference: tuple[str, float] | None = None, **named: str) -> Chart:
-    """Curves of metrics under other names; a metric that is not logged at every update has fewer points."""
+    """Chart of metrics under new names; a metric that is not logged at every update has fewer points."""
     curves = [_curve(lines, key, name) for key, name in named.items()]
     return Chart(title, "update", label, curves, reference=reference)
 
 
 def _curve(lines: Lines, key: str, name: str | None = None) -> Curve:
-    there = [line for line in lines if key in line]
-    return Curve(name or key, [line["update"] for line in there], [line[key] for line in there])
+    logged = [line for line in lines if key in line]
+    return Curve(name or key, [line["update"] for line in logged], [line[key] for line in logged])

@@ -1,4 +1,4 @@
-"""A report as one page of HTML: table, paired comparison, learning curves, animations and the facts to repeat it."""
+"""A report as a page of HTML: table, paired comparison, learning curves, animations and the facts to repeat all."""
 
 import math
 import os
@@ -20,11 +20,11 @@ from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
 
 @dataclass(frozen=True)
 class ResultRow:
-    """One policy's row in the table of a report."""
+    """A policy's row in the table of a report."""
 
     name: str
     estimates: Mapping[str, MeanInterval]
-    """By column of an `Evaluation`; one that is missing was not measured."""
+    """By column of an `Evaluation`; a missing column was not measured."""
     note: str = ""
     emphasized: bool = False
 
@@ -35,10 +35,10 @@ class ResultRow:
         """The row of an evaluation.
 
         Args:
-            evaluation: of the policy.
-            columns: to show, some of `COLUMNS`.
-            note: below the name.
-            emphasized: True = in bold.
+            evaluation: Evaluation of the policy.
+            columns: Columns of the table, such as `COLUMNS`.
+            note: Text below the name, in small letters.
+            emphasized: True writes the row in bold letters.
         """
         estimates = {column.source: evaluation.mean_and_error(column.source) for column in columns}
         return cls(evaluation.name, estimates, note, emphasized)
@@ -91,7 +91,7 @@ class PairedComparison:
 
 @dataclass(frozen=True)
 class ChartGroup:
-    """Charts side by side under one heading."""
+    """Charts side by side under a heading."""
 
     title: str
     charts: Sequence[Chart]
@@ -100,7 +100,7 @@ class ChartGroup:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything on the page. Only the title is needed; what is empty is left out."""
+    """Contents of the page. Only the title is needed; empty contents are left out."""
 
     title: str
     summary: Sequence[str] = ()
@@ -118,17 +118,17 @@ class Report:
 
 
 def write_report(path: str | os.PathLike[str], report: Report) -> None:
-    """Write the report as one self-contained HTML page, whole or not at all.
+    """Write the report as a self-contained HTML page, complete or not at all.
 
     Args:
-        path: of the page.
-        report: its contents.
+        path: File of the page, replaced if present.
+        report: Contents of the page.
     """
     write_text(Path(path), report_html(report))
 
 
 def report_html(report: Report) -> str:
-    """The whole page; what is empty is left out."""
+    """The page as HTML; empty contents are left out."""
     lead = "".join(f'<p class="lead">{escape(text)}</p>' for text in report.summary)
     # 1. The result.
     sections = [
@@ -162,16 +162,16 @@ def report_table(report: Report) -> Table:
     caption = f"{report.table_note} Mean ± standard error over scenarios.".lstrip() if report.rows else None
     table = Table(title=report.title, caption=caption, title_justify="left", caption_justify="left")
     table.add_column("policy", no_wrap=True)
-    shown = _shown_columns(report.rows, COLUMNS)
-    for column in shown:
+    columns = _measured_columns(report.rows, COLUMNS)
+    for column in columns:
         table.add_column(column.label, justify="right")
     for row in report.rows:
-        cells = [column.cell(row.estimates.get(column.source)) for column in shown]
+        cells = [column.cell(row.estimates.get(column.source)) for column in columns]
         table.add_row(row.name, *cells, style="bold" if row.emphasized else None)
     return table
 
 
-def _shown_columns(rows: Sequence[ResultRow], columns: Sequence[Column]) -> list[Column]:
+def _measured_columns(rows: Sequence[ResultRow], columns: Sequence[Column]) -> list[Column]:
     return [column for column in columns if any(column.source in row.estimates for row in rows)]
 
 
@@ -181,7 +181,7 @@ def _sentence(text: str) -> str:
 
 
 def _tiles_html(report: Report) -> str:
-    """The two compared means and their difference, large."""
+    """The two compared means and the difference, large."""
     comparison = report.comparison
     if comparison is None:
         return ""
@@ -199,13 +199,12 @@ def _tiles_html(report: Report) -> str:
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
-def _tile_html(what: str, value: str, interval: tuple[float, float], tone: str = "") -> str:
+def _tile_html(title: str, value: str, interval: tuple[float, float], tone: str = "") -> str:
     # no interval over fewer than two scenarios
-    limits = (
-        f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>' if math.isfinite(interval[0]) else ""
-    )
+    limits = f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>'
+    limits = limits if math.isfinite(interval[0]) else ""
     return (
-        f'<div class="card tile {tone}"><div class="what">{escape(what)}</div>'
+        f'<div class="card tile {tone}"><div class="what">{escape(title)}</div>'
         f'<div class="value">{value}</div>{limits}</div>'
     )
 
@@ -224,18 +223,19 @@ _DRIFT_MEANS = (
 
 
 def _table_html(title: str, rows: Sequence[ResultRow], columns: Sequence[Column], note: str) -> str:
-    """A table with a heading and a note below; empty where no row has one of the columns."""
-    shown = _shown_columns(rows, columns)
-    if not shown:
+    """A table with a heading and a note below; empty where no row has any of the columns."""
+    columns = _measured_columns(rows, columns)
+    if not columns:
         return ""
     headings = "".join(
-        f'<th scope="col"><abbr title="{escape(c.meaning)}; {c.better}">{escape(c.label)}</abbr></th>' for c in shown
+        f'<th scope="col"><abbr title="{escape(c.meaning)}; {c.direction_text}">{escape(c.label)}</abbr></th>'
+        for c in columns
     )
     body = []
     for row in rows:
         below = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
         style = ' class="emphasized"' if row.emphasized else ""
-        cells = "".join(_cell_html(column, row.estimates.get(column.source)) for column in shown)
+        cells = "".join(_cell_html(column, row.estimates.get(column.source)) for column in columns)
         body.append(f'<tr{style}><th scope="row">{escape(row.name)}{below}</th>{cells}</tr>')
     return (
         f'<h2>{escape(title)}</h2><div class="card scroll" tabindex="0"><table class="results"><thead><tr>'
@@ -246,7 +246,7 @@ def _table_html(title: str, rows: Sequence[ResultRow], columns: Sequence[Column]
 
 
 def _cell_html(column: Column, estimate: MeanInterval | None) -> str:
-    """A cell with the 95 % interval as its tooltip."""
+    """A cell with the 95 % interval as the tooltip."""
     if estimate is None or not math.isfinite(estimate.mean):
         return "<td>–</td>"
     if not math.isfinite(estimate.standard_error):
@@ -272,14 +272,14 @@ def _comparison_html(comparison: PairedComparison | None) -> str:
 
 
 def _difference_svg(comparison: PairedComparison) -> str:
-    """A dot per scenario, the mean with its interval below, zero dashed."""
+    """A dot per scenario, the mean and the interval below, zero dashed."""
     width, margin, base = 520, 24, 108
     # one dot per scenario, from left to right: `_stacked` needs them sorted
     dots = np.sort(np.asarray(comparison.differences, float))
     dots = dots[np.isfinite(dots)]
     # zero belongs to the axis even if all differences lie on one side
-    shown = np.concatenate([dots, comparison.interval, [0.0, comparison.mean_difference]])
-    low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+    values = np.concatenate([dots, comparison.interval, [0.0, comparison.mean_difference]])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low == high:
         low, high = low - 1, high + 1
 
@@ -287,31 +287,31 @@ def _difference_svg(comparison: PairedComparison) -> str:
         return margin + (value - low) / (high - low) * (width - 2 * margin)
 
     tone = "var(--good)" if comparison.is_better else "var(--bad)" if comparison.is_worse else "var(--accent)"
-    parts = []
+    shapes = []
     ticks = nice_ticks(low, high, 6)
     for tick in ticks:
         label = format_tick(tick, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
-        parts.append(f'<path class="tick" d="M{across(tick):.1f} {base}v5"/>')
-        parts.append(f'<text x="{across(tick):.1f}" y="{base + 18}" text-anchor="middle">{label}</text>')
-    parts.append(f'<path class="axis" d="M{margin} {base}H{width - margin}"/>')
-    parts.append(f'<path class="zero" d="M{across(0.0):.1f} 4V{base}"/>')
+        shapes.append(f'<path class="tick" d="M{across(tick):.1f} {base}v5"/>')
+        shapes.append(f'<text x="{across(tick):.1f}" y="{base + 18}" text-anchor="middle">{label}</text>')
+    shapes.append(f'<path class="axis" d="M{margin} {base}H{width - margin}"/>')
+    shapes.append(f'<path class="zero" d="M{across(0.0):.1f} 4V{base}"/>')
     for value, height in zip(dots, _stacked(np.array([across(v) for v in dots]), diameter=7.0)):
         color = "var(--good)" if value > 0 else "var(--bad)" if value < 0 else "var(--muted)"
         # dots that touch are stacked, up to the upper border
         y = 70 - min(height * 7, 62)
-        parts.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{color}" opacity=".65"/>')
+        shapes.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{color}" opacity=".65"/>')
     if math.isfinite(comparison.interval[0]):  # no interval over a single scenario or street network
         start, stop = (across(v) for v in comparison.interval)
-        parts.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
-    parts.append(f'<circle cx="{across(comparison.mean_difference):.1f}" cy="91" r="6.5" fill="{tone}"/>')
+        shapes.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
+    shapes.append(f'<circle cx="{across(comparison.mean_difference):.1f}" cy="91" r="6.5" fill="{tone}"/>')
     dots_label = "a dot per scenario, " if len(dots) else ""
     caption = f"{dots_label}mean and 95 % interval; {escape(comparison.second)} minus {escape(comparison.first)}"
-    parts.append(f'<text x="{width / 2}" y="{base + 38}" text-anchor="middle">{caption}</text>')
-    return f'<svg viewBox="0 0 {width} 152" role="img" aria-label="{caption}">{"".join(parts)}</svg>'
+    shapes.append(f'<text x="{width / 2}" y="{base + 38}" text-anchor="middle">{caption}</text>')
+    return f'<svg viewBox="0 0 {width} 152" role="img" aria-label="{caption}">{"".join(shapes)}</svg>'
 
 
 def _stacked(across: np.ndarray, diameter: float) -> list[int]:
-    """For sorted positions, the lowest row in which each dot touches no earlier one."""
+    """For sorted positions, the lowest row in which each dot touches no earlier dot."""
     last: list[float] = []  # position of the last dot of each row
     rows = []
     for x in across:

@@ -1,4 +1,4 @@
-"""Scores of a policy on scenarios, one row per scenario, and how they came about, in one Parquet file.
+"""Scores of a policy on scenarios and the provenance, in a Parquet file with a row per scenario.
 
 Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and `*_rate` in [0, 1], lower is better.
 """
@@ -36,23 +36,11 @@ NUMBERS_VERSION = "0.1.0"
 no number keeps it, so that results outlive releases."""
 LIKELIHOOD_COLUMNS = tuple(f"{feature}_likelihood" for feature in FEATURE_NAMES)
 SCORE_COLUMNS = (
-    "meta_metric",
-    "meta_metric_light_one",
-    "kinematic",
-    "interactive",
-    "map_based",
-    *LIKELIHOOD_COLUMNS,
-    "min_average_displacement_error",
-    "average_displacement_error",
-    "collision_rate",
-    "offroad_rate",
-    "unlogged_offroad_rate",
-    "traffic_light_violation_rate",
-    "miss_rate",
-    "passing_miss_rate",
-    "min_passing_miss_rate",
+    "meta_metric", "meta_metric_light_one", "kinematic", "interactive", "map_based", *LIKELIHOOD_COLUMNS,
+    "min_average_displacement_error", "average_displacement_error", "collision_rate", "offroad_rate",
+    "unlogged_offroad_rate", "traffic_light_violation_rate", "miss_rate", "passing_miss_rate", "min_passing_miss_rate",
     *Drift._fields,
-)
+)  # fmt: skip
 """`meta_metric_light_one` is the meta-metric with the traffic light likelihood set to 1, as published tables of models
 without a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`; drift:
 `evaluation.drift`."""
@@ -61,13 +49,8 @@ LABELS = {"RMM": "meta_metric"}
 CLUSTER = "cluster"
 """Column with the street network or recording of a scenario; empty where the data set does not know it."""
 SCHEMA = pa.schema(
-    [
-        pa.field("scenario_id", pa.string()),
-        pa.field("num_agents", pa.int32()),
-        pa.field("num_evaluated", pa.int32()),
-        pa.field(CLUSTER, pa.string()),
-        *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
-    ]
+    {"scenario_id": pa.string(), "num_agents": pa.int32(), "num_evaluated": pa.int32(), CLUSTER: pa.string()}
+    | dict.fromkeys(SCORE_COLUMNS, pa.float64())
 )
 
 LARGEST = 1e7
@@ -75,7 +58,7 @@ LARGEST = 1e7
 ROUNDING = 1e-6
 """Sums of weighted likelihoods may be this far out of [0, 1]."""
 
-GoalsGiven = Literal["none", "logged"]
+GoalChoice = Literal["none", "logged"]
 
 
 @dataclass(frozen=True)
@@ -100,7 +83,7 @@ class EvaluateConfig:
     quarter to a third faster with 32; SMART-tiny is not."""
     jobs: int = 1
     """Processes, each with one thread. Changes no result."""
-    goals: GoalsGiven = "none"
+    goals: GoalChoice = "none"
     """Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model."""
 
     def __post_init__(self) -> None:
@@ -118,7 +101,7 @@ class EvaluateConfig:
         return Sampling(self.temperature, self.top_k)
 
     def what_counts(self) -> dict[str, object]:
-        """The settings that results depend on, for one and the same scenario."""
+        """The settings that the results of a scenario depend on."""
         # Three change no result of a scenario. goals="none" is left out, too: evaluations from before there were goals
         # are still what they were.
         ignored = ("limit", "rollouts_per_pass", "jobs", *(("goals",) if self.goals == "none" else ()))
@@ -162,7 +145,7 @@ class Provenance:
         return cls(**{**plain, "config": EvaluateConfig(**values["config"])})
 
     def what_counts(self) -> dict[str, object]:
-        """The values that results of the same work share. The data set may move: its manifest identifies it."""
+        """The values that results of the same work share; the manifest identifies a data set that was moved."""
         return {
             "policy_fingerprint": self.policy_fingerprint,
             "manifest_sha256": self.manifest_sha256,
@@ -170,15 +153,15 @@ class Provenance:
             **self.config.what_counts(),
         }
 
-    def differences(self, other: "Provenance") -> list[str]:
+    def differences(self, expected: "Provenance") -> list[str]:
         """Names of the values that count and differ."""
-        mine, theirs = self.what_counts(), other.what_counts()
-        return [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
+        values, expected_values = self.what_counts(), expected.what_counts()
+        return [name for name in {**values, **expected_values} if values.get(name) != expected_values.get(name)]
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Scores of one policy on the scenarios of a data set.
+    """Scores of a policy on the scenarios of a data set.
 
     `evaluation["meta_metric"]` is a column [scenarios], `len(evaluation)` the number of scored scenarios.
     """
@@ -211,13 +194,13 @@ class Evaluation:
     def _title(self) -> str:
         notes = [f"{len(self.skipped)} skipped"] if self.skipped else []
         notes += [f"{self.num_with_rmm} with RMM"] if self.num_with_rmm < len(self) else []
-        of_these = f" ({', '.join(notes)})" if notes else ""
+        note = f" ({', '.join(notes)})" if notes else ""
         config = self.config
-        return f"{self.name}, {len(self)} scenarios{of_these} x {config.num_rollouts} rollouts, metric {config.metric}"
+        return f"{self.name}, {len(self)} scenarios{note} x {config.num_rollouts} rollouts, metric {config.metric}"
 
     @property
     def num_with_rmm(self) -> int:
-        """Scenarios whose meta-metric is defined, over which its mean is taken: all terms of it need a value."""
+        """Number of scenarios in the mean meta-metric: scenarios with a value of every term."""
         return self.mean_and_error("meta_metric").count
 
     @property
@@ -227,7 +210,7 @@ class Evaluation:
 
     @property
     def data_note(self) -> str:
-        """A sentence on guessed values of the log; empty where none is."""
+        """A sentence on guessed values of the log; empty without any."""
         return guessed_note(self.provenance.sources, self.provenance.guessed)
 
     @cached_property
@@ -237,7 +220,7 @@ class Evaluation:
 
     @cached_property
     def clusters(self) -> np.ndarray:
-        """Label of each scenario's street network or recording; its own id where that is unknown."""
+        """Label of each scenario's street network or recording; the scenario's id where the label is unknown."""
         labels = self.table[CLUSTER].to_pylist()
         return np.array([label or scenario_id for label, scenario_id in zip(labels, self.scenario_ids)], dtype=object)
 
@@ -245,7 +228,7 @@ class Evaluation:
         """A column as float64 [scenarios].
 
         Raises:
-            ConfigError: there is no such column.
+            ConfigError: A column that no evaluation has.
         """
         column = LABELS.get(column, column)
         if column not in SCORE_COLUMNS:
@@ -256,12 +239,12 @@ class Evaluation:
         """Mean, standard error and 95 % interval over the scenarios that have a value.
 
         Raises:
-            ConfigError: there is no such column.
+            ConfigError: A column that no evaluation has.
         """
         return mean_interval(self.values(column))
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write as Parquet, whole or not at all."""
+        """Write as Parquet, complete or not at all."""
         about = {
             "format": FORMAT,
             "name": self.name,
@@ -276,7 +259,7 @@ class Evaluation:
         """Read the file that `write` wrote.
 
         Raises:
-            DataError: no such file, a folder, a damaged file, or not an evaluation of this version.
+            DataError: A missing file, a folder, a damaged file, or not an evaluation of this version.
         """
         # Parquet readers take a folder for one table in many files: two evaluations would become one.
         if Path(path).is_dir():
@@ -300,12 +283,12 @@ class Evaluation:
             table = table.select(SCHEMA.names)
             _check_scores(table)
             name, skipped = about["name"], about["skipped"]
-            if not all(isinstance(text, str) for one in skipped for text in one.values()):
+            if not all(isinstance(text, str) for entry in skipped for text in entry.values()):
                 raise DataError("a skipped scenario or its reason is no text")
-            skipped = tuple(Skipped(**one) for one in skipped)
-            for given, kind in ((name, str), (about["provenance"], dict)):
-                if not isinstance(given, kind):
-                    raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_type(given)}")
+            skipped = tuple(Skipped(**entry) for entry in skipped)
+            for key, value_type in (("name", str), ("provenance", dict)):
+                if not isinstance(about[key], value_type):
+                    raise DataError(f"its {key} is {describe_type(about[key])}")
         except (TypeError, KeyError, AttributeError, DataError) as error:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         try:
@@ -318,7 +301,7 @@ class Evaluation:
 
 
 def _check_scores(table: pa.Table) -> None:
-    """Check that scores can be what their columns say; NaN = not defined in a scenario.
+    """Check that scores lie in the range of the column; NaN = not defined in a scenario.
 
     Raises:
         DataError: A number that is out of range or infinite; the message names column and scenario.
@@ -332,37 +315,37 @@ def _check_scores(table: pa.Table) -> None:
         is_fraction = name.endswith("_rate") or (direction == "higher" and not name.startswith("num_"))
         highest = 1.0 + ROUNDING if is_fraction else LARGEST
         values = table[name].to_numpy()
-        wrong = (values < lowest - ROUNDING) | (values > highest)
-        if wrong.any():
-            row = int(np.flatnonzero(wrong)[0])
+        outliers = np.flatnonzero((values < lowest - ROUNDING) | (values > highest))
+        if len(outliers):
+            row = int(outliers[0])
             scenario_id = table["scenario_id"][row].as_py()[:80]
-            wanted = "in [0, 1]" if is_fraction else f"within {LARGEST:g}" if lowest < 0 else f"in [0, {LARGEST:g}]"
-            raise DataError(f"{name} of scenario {scenario_id} is {values[row]:g}, not {wanted}")
+            limits = "in [0, 1]" if is_fraction else f"within {LARGEST:g}" if lowest < 0 else f"in [0, {LARGEST:g}]"
+            raise DataError(f"{name} of scenario {scenario_id} is {values[row]:g}, not {limits}")
 
 
-def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation]) -> Evaluation:
-    """One evaluation of the scenarios of several, in their order.
+def join_evaluations(name: str, provenance: Provenance, evaluations: list[Evaluation]) -> Evaluation:
+    """An evaluation of the scenarios of several evaluations, in the order of the list.
 
     Args:
-        name: of the result.
-        provenance: of the result.
-        parts: evaluations of disjoint scenarios.
+        name: Name of the joined evaluation.
+        provenance: Provenance of the joined evaluation.
+        evaluations: Evaluations of disjoint scenarios.
     """
-    # the empty table: there may be no part with rows; one chunk, so that equal evaluations have equal tables
-    table = pa.concat_tables([SCHEMA.empty_table(), *(part.table for part in parts)]).combine_chunks()
-    return Evaluation(name, provenance, table, tuple(skipped for part in parts for skipped in part.skipped))
+    # the empty table: there may be no evaluation with rows; one chunk, so that equal evaluations have equal tables
+    table = pa.concat_tables([SCHEMA.empty_table(), *(evaluation.table for evaluation in evaluations)]).combine_chunks()
+    return Evaluation(name, provenance, table, tuple(skipped for e in evaluations for skipped in e.skipped))
 
 
 def row_of_result(
     result: RealismResult, scenario: Scenario, states: SimulatedStates, cluster: str | None = None
 ) -> dict[str, object]:
-    """Row of `SCHEMA` for a scenario's rollouts and their scores.
+    """Row of `SCHEMA` for a scenario's rollouts and scores.
 
     Args:
-        result: scores of the rollouts, one scenario.
-        scenario: the scenario, for its miss rates, its drift and numbers of agents.
-        states: the rollouts.
-        cluster: Label of its street network or recording; None = unknown.
+        result: Scores of the rollouts of a single scenario.
+        scenario: Scenario with the logged future, for miss rates, drift and numbers of agents.
+        states: Rollouts that were scored, world frame.
+        cluster: Label of the street network or recording; None = unknown.
     """
     # The meta-metric is a weighted sum of likelihoods: a light likelihood of 1 adds its weight times what it lacks.
     light = result.likelihood(LIGHT)

@@ -1,7 +1,7 @@
-"""Interruptible measurements of many scenarios: finished groups are kept in files, a later call does the rest.
+"""Interruptible measurements of many scenarios: finished groups are stored in files, a later call does the others.
 
-Evaluations and scores of rollout files are kept as `ScenarioRows` (Parquet), goal attainment, reward variances and
-planners as `ScenarioValues` (JSON). `finish_result` makes the one file of a result of them.
+Evaluations and scores of rollout files are stored as `ScenarioRows` (Parquet), goal attainment, reward variances and
+planners as `ScenarioValues` (JSON). `finish_result` joins the groups in the file of the result.
 """
 
 import json
@@ -23,7 +23,7 @@ from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, 
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_folder, remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
-from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, run_items
+from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Inline, Joining, Runner, Share, choose_runner
 
@@ -32,7 +32,7 @@ _GROUP_NAME = re.compile(r"\d{6,}-\d{6,}")
 
 
 class ScenarioFormat(GroupFormat[Stored, Result]):
-    """Files of finished groups of scenarios in a folder, which go when the one file of the result is there."""
+    """Files of finished groups of scenarios in a folder, removed when the file of the result is written."""
 
     folder: Path
 
@@ -143,12 +143,13 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         return None if differences else rows
 
     def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
-        """The result of an earlier call for the same scenarios; None where there is none.
+        """The result of an earlier call for the same scenarios; None without such a result.
 
         Raises:
             ConfigError: A result of other work, or with scenarios that a limit would leave out.
+            DataError: Another file of this name.
         """
-        stored = read_stored(self.result_path, Evaluation.read)
+        stored = read_finished(self.result_path, Evaluation.read)
         if stored is None:
             return None
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
@@ -180,7 +181,7 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
 
 
 def _count_scenarios(evaluation: Evaluation) -> Counter[str]:
-    """Number of rows of each scenario of an evaluation, those without scores included."""
+    """Number of rows of each scenario of an evaluation, scenarios without scores included."""
     return Counter([*evaluation.scenario_ids, *(skipped.scenario_id for skipped in evaluation.skipped)])
 
 
@@ -195,22 +196,22 @@ def resume_evaluation(
     runner: Runner,
     show_progress: bool = True,
 ) -> Evaluation:
-    """Do what is missing of an evaluation, write `out/<name>.parquet` and return it; only read it if it is there.
+    """The evaluation `out/<name>.parquet`: read, or made by the work on all missing scenarios.
 
     Args:
         title: Name of the work, in front of the progress bar.
-        scenario_ids: Ids of all scenarios of the evaluation, in the order of its rows.
-        work: Function from the position of a scenario to a row of `SCHEMA`, or to the reason that there is none.
-        name: Name of the evaluation, also that of the file.
-        provenance: Values that a stored result must agree with to be this one.
-        out: Folder of the result; None keeps nothing.
+        scenario_ids: Ids of all scenarios of the evaluation, in the order of the rows.
+        work: Function from the position of a scenario to a row of `SCHEMA`, or to the reason for a missing row.
+        name: Name of the evaluation and of the file.
+        provenance: Values that a stored result must agree with, else the call ends with an error.
+        out: Folder of the result; None stores no file.
         runner: Runner of the groups that are missing; changes no result.
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        ConfigError: The name cannot be a file's, the stored result is of other work, a limit would leave out scenarios
-            of it, or there is no folder in which shares could meet.
-        DataError: Another driver is at work on this evaluation.
+        ConfigError: A name that no file can have, a stored result of other work, a limit that would leave out stored
+            scenarios, or shares without a folder to meet in.
+        DataError: A second driver at work on this evaluation.
         SetAside, Unfinished: See `run_items`.
     """
     if out is None and isinstance(runner, Share | Joining):
@@ -249,7 +250,7 @@ def measure_scenarios(
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        NotYetError: Another process is at work in the folder.
+        NotYetError: A second process at work in the folder.
         SetAside: See `run_items`.
     """
     groups = group_positions(len(format.scenario_ids), format.items_per_file)
@@ -262,10 +263,10 @@ def measure_scenarios(
 
 @runtime_checkable
 class Writable(Protocol):
-    """A result that is kept in one file."""
+    """A result that is stored in a single file."""
 
     def write(self, path: Path) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file, complete or not at all."""
         ...
 
 
@@ -284,22 +285,22 @@ def finish_result(
     runner: Runner,
     show_progress: bool = True,
 ) -> FinishedResult:
-    """The result that an earlier call finished, or the one that is made now and written to its file.
+    """The result that an earlier call finished, or a new result, written to the file.
 
     Args:
         title: Name of the work, in front of the progress bar.
         scenario_ids: Ids of all scenarios of the result.
         work: Function from the position of a scenario to the result of the scenario.
         path: File of the result.
-        format: Files of finished groups, removed in the end. All of them stay where the folder holds others, or lock
-            files of shares while `runner` is none: then a longer run is unfinished there.
-        find: Reader of the finished result; returns None where there is none.
+        format: Files of finished groups, removed in the end. All stay if a longer run is unfinished in the folder: with
+            further groups, or with lock files of shares while `runner` is no share.
+        find: Reader of the finished result; returns None for a missing result.
         combine: Maker of the result from all groups, in the order of the scenarios.
         runner: Runner of the groups that are missing; changes no result.
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: Another driver is at work on this result.
+        DataError: A second driver at work on this result.
     """
     check_folder(path.parent, "results")
     stamp, result = _stamp(path), find()
@@ -324,9 +325,9 @@ def finish_result(
 
 
 def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:
-    """Remove the groups of a finished result, but for those of a longer run that is not.
+    """Remove the groups of a finished result, but not the groups of an unfinished longer run.
 
-    A share that has ended leaves its lock file until all are put together: its groups may be of a longer run, too.
+    A share that has ended leaves a lock file until all shares are joined: the groups may be of a longer run, too.
     """
     is_share = isinstance(runner, Share | Joining)
     has_shares = any(format.folder.glob(".lock.*-of-*")) and not is_share
@@ -336,16 +337,15 @@ def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str]
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Time and size of a file, which tell whether it was replaced; None where there is none."""
-    try:
+    """Time and size of a file, which change with a replacement; None for a missing file."""
+    with suppress(OSError):
         status = path.stat()
-    except OSError:
-        return None
-    return status.st_mtime_ns, status.st_size
+        return status.st_mtime_ns, status.st_size
+    return None
 
 
 def check_same_work(path: Path, differences: Sequence[str], way_out: str) -> None:
-    """Check that a stored result is not of other work, which the new one would replace.
+    """Check that a stored result is not of other work, which the new result would replace.
 
     Args:
         path: File of the stored result.
@@ -353,24 +353,24 @@ def check_same_work(path: Path, differences: Sequence[str], way_out: str) -> Non
         way_out: Flags that keep the two apart, for the message.
 
     Raises:
-        ConfigError: There is such a value.
+        ConfigError: Any difference.
     """
     if differences:
         raise ConfigError(f"{path} is the result of another {', '.join(differences)}: {way_out}, or remove the file.")
 
 
 def check_scenarios_stay(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:
-    """Check that a result is not replaced by one without some of its scenarios, of a quick look.
+    """Check that a quick look with fewer scenarios does not replace a result.
 
     Args:
         path: File of the stored result.
         num_stored: Number of scenarios in the stored result.
-        num_left_out: Number of those that the new result would not have.
-        choice: Setting that leaves them out, as the message names it.
+        num_left_out: Number of stored scenarios that the new result would not have.
+        choice: Setting that leaves scenarios out, in the words of the message.
         way_out: End of the message.
 
     Raises:
-        ConfigError: There are such scenarios.
+        ConfigError: A stored scenario that would be left out.
     """
     if num_left_out > 0:
         raise ConfigError(
@@ -379,17 +379,18 @@ def check_scenarios_stay(path: Path, num_stored: int, num_left_out: int, choice:
         )
 
 
-def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
-    """A stored result; None for a missing file, or a damaged one, which a message names.
+def read_finished(path: Path, read: Callable[[Path], FinishedResult]) -> FinishedResult | None:
+    """The result in a file; None for a missing file.
 
     Args:
-        path: File of the result.
-        read: Reader of the file; raises a DataError with the way out, which is to do the work again.
+        path: File that a new result would replace.
+        read: Reader of the file; raises a DataError that ends in a way out.
+
+    Raises:
+        DataError: A file that is no such result, or damaged, and that may be a user's, so it stays.
     """
-    if not path.exists():
-        return None
     try:
-        return read(path)
+        return read(path) if path.exists() else None
     except DataError as error:
-        log.info(f"{error} Doing so.")
-        return None
+        cause = str(error).removeprefix(f"{path}: ").rpartition(": ")[0]
+        raise DataError(f"{path} is in the way ({cause}): choose another --out, or remove the file.") from None

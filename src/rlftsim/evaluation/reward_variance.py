@@ -1,8 +1,8 @@
-"""Variance of a rollout's reward against the number N of rollouts it is computed from.
+"""Variance of a rollout's reward against the number N of rollouts in the computation.
 
-Many rollouts of a scenario are simulated once. For each N, random subsets of N of them are scored as training would
-score them, and the rewards of all their members are kept. Their mean is 0 by construction, so their mean square is
-their variance. A file per scenario is kept: an interrupted measurement is resumed.
+Many rollouts of a scenario are simulated once. For each N, random subsets of N rollouts are scored as in training, and
+the rewards of all members are stored. The mean is 0 by construction, so the mean square is the variance. A file per
+scenario is stored: an interrupted measurement is resumed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,7 +55,7 @@ def measure_variances(
     *,
     show_progress: bool = True,
 ) -> Variances:
-    """Variances of a policy's rewards for each number of rollouts in `SIZES` that there are.
+    """Variances of a policy's rewards for each number of rollouts in `SIZES`, up to the settings' number.
 
     Args:
         policy: Policy whose rollouts are scored; need not be trainable.
@@ -66,7 +66,7 @@ def measure_variances(
 
     Raises:
         ConfigError: Too few rollouts for a slope.
-        DataError: Not one scenario can be scored, or another process is at work in the folder.
+        DataError: No scenario that can be scored, or a second process at work in the folder.
     """
     dataset, config = open_held_out(data, config)
     sizes = tuple(size for size in SIZES if size <= config.num_rollouts)
@@ -80,7 +80,7 @@ def measure_variances(
     identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
     stored = measure_scenarios(
         "variances",
-        partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes)),
+        partial(_measure_scenario, frozen_copy(policy), dataset, config, sizes),
         ScenarioValues(Path(out), ids, dict.fromkeys(ids, identity), _parse_variances),
         jobs=config.jobs,
         show_progress=show_progress,
@@ -99,7 +99,7 @@ def variance_by_size(
     """Mean square of the rewards in random subsets of the rollouts.
 
     Args:
-        score_subset: Rewards of some rollouts, computed from these alone.
+        score_subset: Function from the numbers of rollouts to the rewards, computed from these alone.
         num_rollouts: Number of rollouts that subsets are drawn from.
         sizes: Numbers N of rollouts in a subset, each at most `num_rollouts`.
         rng: Generator of the subsets.
@@ -114,18 +114,8 @@ def variance_by_size(
     return variances
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
-
-    policy: Policy
-    dataset: ScenarioDataset
-    config: EvaluateConfig
-    sizes: tuple[int, ...]
-
-
 def _parse_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
-    """Stored variances of a scenario [rewards, sizes]; empty for one that cannot be scored.
+    """Stored variances of a scenario [rewards, sizes]; empty for a scenario that cannot be scored.
 
     Raises:
         ValueError: Values of other axes.
@@ -136,25 +126,27 @@ def _parse_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.nd
     return variances
 
 
-def _measure_scenario(job: _Job, position: int) -> dict[str, object]:
+def _measure_scenario(
+    policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig, sizes: tuple[int, ...], position: int
+) -> dict[str, object]:
     """Simulate once and score subsets of the rollouts."""
-    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
+    scenario, device = dataset[position], get_device(policy)
     try:
         log = scenario_log(scenario, device)
     except DataError as error:
         return {"variances": [], "skipped": str(error)}
     # features once for all rollouts: subsets pick rows of them, which is what training would compute
-    features = compute_features(log, simulate_states(job.policy, scenario, config, device))
+    features = compute_features(log, simulate_states(policy, scenario, config, device))
     score_subset = partial(_score_subset, log, features, config.metric)
     # by scenario: neither the order of the scenarios nor the number of processes changes the subsets
     rng = np.random.default_rng([config.seed, *scenario.scenario_id.encode()])
-    return {"variances": variance_by_size(score_subset, config.num_rollouts, job.sizes, rng).tolist()}
+    return {"variances": variance_by_size(score_subset, config.num_rollouts, sizes, rng).tolist()}
 
 
 def _score_subset(
     log: ScenarioLog, features: Features, metric: str, rollout_ids: Int[np.ndarray, "n"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Both rewards of some rollouts, as training computes them from these rollouts alone."""
+    """Both rewards of a subset of rollouts, computed as in training, from these rollouts alone."""
     # every tensor of the features has the rollouts first
     index = torch.from_numpy(rollout_ids).to(features.linear_speed.device)
     subset = {name: values[index] for name, values in vars(features).items() if isinstance(values, Tensor)}

@@ -16,7 +16,7 @@ from rlftsim.evaluation.rollout_files import AXES
 from rlftsim.geometry import wrapped
 from rlftsim.jobs.progress import log
 from rlftsim.realism import SimulatedStates
-from rlftsim.scenario.consistency import DRIVING_MPS, LEAST_COSINE, TYPES_WITH_FRONT, find_contrary
+from rlftsim.scenario.consistency import DRIVING_MPS, MIN_COSINE, TYPES_WITH_FRONT, find_contrary
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, STEP_S, TOTAL_STEPS, Scenario
 
 MAX_DISTANCE_M = 480.0
@@ -82,6 +82,7 @@ class PoseChecks:
         if only_logged and scenario.has_future:
             self.is_judged = tracks.valid[rows, HISTORY_STEPS:TOTAL_STEPS]
 
+    @np.errstate(over="ignore")  # infinitely far is far
     def first_step_errors(self) -> Float32[np.ndarray, "N A"]:
         """Meters from each agent's first position to that of constant velocity, or to the current one if nearer."""
         first, now = self.poses[:, :, :2, 0], self.position[:, :2]
@@ -160,7 +161,7 @@ class PoseChecks:
         dx, dy, facing = np.diff(x[:, rows]), np.diff(y[:, rows]), heading[:, rows, 1:]
         moved = _square(dx, dy)
         is_driving = (moved > (DRIVING_MPS * STEP_S) ** 2) & self.is_judged[rows, 1:] & self.is_judged[rows, :-1]
-        is_askew = (dx * np.cos(facing) + dy * np.sin(facing)) ** 2 < LEAST_COSINE**2 * moved
+        is_askew = (dx * np.cos(facing) + dy * np.sin(facing)) ** 2 < MIN_COSINE**2 * moved
         contrary, num_judged = find_contrary(*(steps.reshape(-1, dx.shape[-1]) for steps in (is_driving, is_askew)))
         if 2 * len(contrary) > num_judged:
             rollout, agent = divmod(int(contrary[0]), len(rows))
@@ -205,6 +206,7 @@ class _Largest:
         return _Largest(math.sqrt(self.value), self.rollout, self.agent)
 
 
+@np.errstate(over="ignore")
 def _square(dx: Float32[np.ndarray, "N A t"], dy: Float32[np.ndarray, "N A t"]) -> Float32[np.ndarray, "N A t"]:
     return dx * dx + dy * dy
 

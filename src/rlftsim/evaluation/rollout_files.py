@@ -1,7 +1,7 @@
-"""Rollouts in files, from any simulator: npz of one scenario, or submission files of the Sim Agents challenge.
+"""Rollouts in files, from any simulator: npz of a scenario, or submission files of the Sim Agents challenge.
 
-`find_rollouts` lists the scenarios without reading trajectories; `read_states` reads one scenario's. Pickles are never
-loaded, because loading one runs any code in it: docs/rollout_formats.md explains the conversion.
+`find_rollouts` lists the scenarios without reading trajectories; `read_states` reads the rollouts of a scenario. No
+pickle is ever loaded, because loading runs any code in the file: docs/rollout_formats.md explains the conversion.
 """
 
 import re
@@ -33,16 +33,16 @@ _SUBMISSION_NAME = re.compile(r"\.(binproto|pb)(-\d+-of-\d+)?$")
 _PICKLE_NAME = re.compile(r"\.(pkl|pickle|pt|pth|ckpt|joblib)$")
 _ZIP_MAGIC, _GZIP_MAGIC, _PICKLE_MAGIC = b"PK\x03\x04", b"\x1f\x8b", tuple(b"\x80" + bytes([n]) for n in range(2, 6))
 
-Kind = Literal["npz", "submission"]
+FileFormat = Literal["npz", "submission"]
 
 
 @dataclass(frozen=True)
 class RolloutEntry:
-    """Place of one scenario's rollouts."""
+    """Location of a scenario's rollouts."""
 
     scenario_id: str
     file: Path
-    kind: Kind
+    format: FileFormat
     start: int = 0
     """First byte of the scenario's message in a submission file."""
     stop: int = 0
@@ -52,14 +52,14 @@ class RolloutEntry:
 
 
 def find_rollouts(source: str | PathLike[str]) -> list[RolloutEntry]:
-    """Scenarios that have rollouts in a file or folder, by path and place in the file.
+    """Scenarios that have rollouts in a file or folder, by path and position in the file.
 
     Args:
-        source: an npz, a submission file of any name, or a folder with such files in it or its subfolders (`*.npz`,
-            `*.binproto`, `*.binproto-00000-of-00150`, `*.pb`).
+        source: An npz, a submission file of any name, or a folder with such files at any depth (`*.npz`, `*.binproto`,
+            `*.binproto-00000-of-00150`, `*.pb`).
 
     Raises:
-        DataError: nothing there, a pickle, an archive that has to be unpacked, or a damaged file.
+        DataError: No rollouts, a pickle, an archive that has to be unpacked, or a damaged file.
     """
     source = Path(source)
     if source.is_file():
@@ -78,20 +78,20 @@ def find_rollouts(source: str | PathLike[str]) -> list[RolloutEntry]:
 
 
 def read_states(entry: RolloutEntry) -> SimulatedStates:
-    """One scenario's rollouts, checked to be finite numbers within `MAX_COORDINATE_M` of the origin.
+    """Rollouts of a scenario, checked to be finite numbers within `MAX_COORDINATE_M` of the origin.
 
     Raises:
-        DataError: wrong shapes, keys or numbers of steps, agents that differ between rollouts, values that are no
+        DataError: Wrong shapes, keys or numbers of steps, agents that differ between rollouts, values that are no
             numbers or out of range; the message names the file and the scenario.
     """
     try:
-        states = _states_of_npz(entry) if entry.kind == "npz" else _states_of_submission(entry)
+        states = _states_of_npz(entry) if entry.format == "npz" else _states_of_submission(entry)
         states.check_finite()
         for axis in AXES[:3]:
             values = getattr(states, axis)  # [N, A, 80]
-            far = (values.abs() > MAX_COORDINATE_M).nonzero()
-            if len(far):
-                rollout, agent, step = far[0].tolist()
+            outliers = (values.abs() > MAX_COORDINATE_M).nonzero()
+            if len(outliers):
+                rollout, agent, step = outliers[0].tolist()
                 raise DataError(
                     f"{axis} of object id {states.object_id[agent]} in rollout {rollout} at future step {step} is "
                     f"{float(values[rollout, agent, step]):.6g} m, more than {MAX_COORDINATE_M:g} m from the origin: "
@@ -141,7 +141,7 @@ def _list_entries(path: Path) -> list[RolloutEntry]:
 
 
 def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
-    """Some arrays of an npz, none of which may need a pickle."""
+    """Arrays of an npz by key, without a pickle."""
     try:
         arrays = read_npz(path, keys, f"no rollouts file, write it again as npz, {FORMATS_NOTE}")
     except FileNotFoundError:
@@ -170,16 +170,15 @@ def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:
             )
     numbers = [len(values) for values in arrays.values()]
     if len(set(numbers)) > 1:
-        raise DataError(
-            f"x, y, z and heading hold {', '.join(map(str, numbers))} rollouts: there must be equally many."
-        )
+        text = ", ".join(map(str, numbers))
+        raise DataError(f"x, y, z and heading hold {text} rollouts: there must be equally many.")
     with np.errstate(over="ignore"):  # what becomes infinite is refused by name
         x, y, z, heading = (torch.from_numpy(np.ascontiguousarray(arrays[axis], np.float32)) for axis in AXES)
     return SimulatedStates(ids.astype(np.int64), x, y, z, heading)
 
 
 def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:
-    """Scenarios of a serialized SimAgentsChallengeSubmission, or the one of a serialized ScenarioRollouts."""
+    """Scenarios of a serialized SimAgentsChallengeSubmission, or the scenario of a serialized ScenarioRollouts."""
     size = path.stat().st_size
     with path.open("rb") as file:
         fields = list(iterate_fields(file, 0, size))
@@ -192,9 +191,8 @@ def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:
             raise DataError("it holds no rollouts")
         for message in messages:
             # ScenarioRollouts: field 1 is the scenario's id
-            names = [
-                f for f in iterate_fields(file, message.start, message.stop) if (f.number, f.wire_type) == (1, BYTES)
-            ]
+            message_fields = iterate_fields(file, message.start, message.stop)
+            names = [field for field in message_fields if (field.number, field.wire_type) == (1, BYTES)]
             if len(names) != 1 or names[0].stop - names[0].start > MAX_ID_LENGTH:
                 raise DataError(f"the rollouts at byte {message.start} name no scenario")
             file.seek(names[0].start)
@@ -219,8 +217,8 @@ def _states_of_submission(entry: RolloutEntry) -> SimulatedStates:
     ids = list(scenes[0])
     for rollout, scene in enumerate(scenes):
         if scene.keys() != scenes[0].keys():
-            other = sorted(scene.keys() ^ scenes[0].keys())
-            raise DataError(f"rollout {rollout} has other agents than rollout 0: object id {other[0]} is in one only.")
+            differing = min(scene.keys() ^ scenes[0].keys())
+            raise DataError(f"rollout {rollout} has other agents than rollout 0: object id {differing} is in one only.")
     values = np.array([[scene[object_id] for object_id in ids] for scene in scenes], np.float32)  # [N, A, 4, 80]
     # for an empty list of agents, whose array has lost its last axes
     values = values.reshape(len(scenes), len(ids), len(AXES), FUTURE_STEPS)
@@ -230,16 +228,16 @@ def _states_of_submission(entry: RolloutEntry) -> SimulatedStates:
 
 def _trajectories_by_id(scene: submission_pb2.JointScene, rollout: int) -> dict[int, np.ndarray]:
     """x, y, z and heading of each agent, [4, 80]."""
-    found: dict[int, np.ndarray] = {}
+    trajectories: dict[int, np.ndarray] = {}
     for trajectory in scene.simulated_trajectories:
         fields = (trajectory.center_x, trajectory.center_y, trajectory.center_z, trajectory.heading)
         lengths = [len(values) for values in fields]
-        where = f"object id {trajectory.object_id} in rollout {rollout}"
-        if not trajectory.HasField("object_id") or trajectory.object_id in found:
-            raise DataError(f"{where}: an agent without an id, or listed twice.")
+        location = f"object id {trajectory.object_id} in rollout {rollout}"
+        if not trajectory.HasField("object_id") or trajectory.object_id in trajectories:
+            raise DataError(f"{location}: an agent without an id, or listed twice.")
         if lengths != [FUTURE_STEPS] * len(AXES):
-            raise DataError(f"{where}: x, y, z, heading have {lengths} steps, {FUTURE_STEPS} are needed.")
+            raise DataError(f"{location}: x, y, z, heading have {lengths} steps, {FUTURE_STEPS} are needed.")
         if not all(trajectory.valid):
-            raise DataError(f"{where}: invalid steps; in the Sim Agents challenge every agent exists at all steps.")
-        found[trajectory.object_id] = np.array(fields, np.float32)
-    return found
+            raise DataError(f"{location}: invalid steps; in the Sim Agents challenge every agent exists at all steps.")
+        trajectories[trajectory.object_id] = np.array(fields, np.float32)
+    return trajectories

@@ -1,6 +1,6 @@
-"""Folder of rollouts: a file for each scenario, and the description that keeps two models out of it.
+"""Folder of rollouts: a file for each scenario, and a description that keeps a second model out.
 
-An interrupted simulation goes on where it was stopped; files that are damaged or cut off are made again.
+An interrupted simulation goes on; files that are damaged or cut off are made again.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,8 +18,8 @@ from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
-from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner
+from rlftsim.realism import SimulatedStates
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, get_device
@@ -33,7 +33,7 @@ ABOUT = "rollouts.json"
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Rollouts that are to be made; is handed to other processes."""
+    """Input of a simulation; is handed to worker processes."""
 
     policy: Policy
     scenarios: ScenarioDataset
@@ -43,7 +43,7 @@ class Simulation:
     goals: GoalsFile = GoalsFile(())  # noqa: RUF009 (frozen)
 
     def describe(self, model: str) -> dict[str, Any]:
-        """Values on which the rollouts depend, as JSON has them, and the name of the model, which may change."""
+        """Values on which the rollouts depend, in types of JSON, and the name of the model, which may change."""
         identity = {
             "model": model,
             "policy": fingerprint_policy(self.policy),
@@ -59,7 +59,7 @@ class Simulation:
 def simulate_folder(
     simulation: Simulation, scenario_ids: Sequence[str], out: Path, *, model: str, runner: Runner
 ) -> list[Path]:
-    """Simulate the scenarios that have no whole file yet; returns the files of all.
+    """Simulate the scenarios that have no complete file yet; returns the files of all.
 
     Args:
         simulation: Policy, data and settings, which must be those of the rollouts that are in the folder.
@@ -69,15 +69,13 @@ def simulate_folder(
         runner: Runner of the work; changes no result.
 
     Raises:
-        ConfigError: The folder holds rollouts of another model or other settings.
-        DataError: A damaged description, or a folder of another type of result.
-        NotYetError: Another driver is at work in the folder.
+        ConfigError: A folder of rollouts of a second model or other settings.
+        DataError: A damaged description, or a folder of a different type of result.
+        NotYetError: A second driver at work in the folder.
         SetAside, Unfinished: See `run_items`.
     """
-    identity, rollouts = (
-        simulation.describe(model),
-        _RolloutFiles(out, "{}.npz".format, num_rollouts=simulation.num_rollouts),
-    )
+    identity = simulation.describe(model)
+    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_read_rollouts, simulation.num_rollouts))
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
@@ -91,54 +89,45 @@ def simulate_folder(
     return paths
 
 
-@dataclass(frozen=True, eq=False)
-class _RolloutFiles(WholeFiles[str]):
-    """Rollouts by scenario id, see `rollout.files`."""
+def _read_rollouts(num_rollouts: int, path: Path) -> SimulatedStates:
+    """Rollouts of the scenario that the file is named after; checksums, types and shapes of the arrays are right.
 
-    num_rollouts: int = 1
-
-    def is_finished(self, item: str) -> bool:
-        """True for a file whose arrays have the right checksums, types and shapes; a warning names any other file."""
-        path = self.read(item)
-        if path is None:
-            return False
-        cause = f"it holds other rollouts than {self.num_rollouts} of its scenario"
-        try:
-            states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == item]
-            if [len(rollouts.x) for rollouts in states] == [self.num_rollouts]:
-                return True
-        except DataError as error:
-            cause = str(error).removeprefix(f"{path} ").rstrip(".")
-        log.warning(f"{path} is simulated again: {cause}.")
-        return False
+    Raises:
+        DataError: Damaged file, or other rollouts.
+    """
+    states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == path.stem]
+    if [len(rollouts.x) for rollouts in states] != [num_rollouts]:
+        raise DataError(f"{path}: it holds other rollouts than {num_rollouts} of its scenario.")
+    return states[0]
 
 
 def _simulate_scenario(
     simulation: Simulation, out: Path, scenario_id: str, advance: Advance, is_stopped: Callable[[], bool]
-) -> None:
-    """Write the rollouts of a scenario, unless the work is being stopped."""
+) -> Path | None:
+    """File with the rollouts of a scenario, written now; None where the work is being stopped."""
     if is_stopped():
-        return
+        return None
     batch = collate([simulation.scenarios.by_id(scenario_id)]).to(get_device(simulation.policy))
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
         sampling=simulation.sampling, goals=goals_of_batch(entries, batch) if entries else None,
     )  # fmt: skip
-    write_rollouts(out, batch, rollouts)
+    [path] = write_rollouts(out, batch, rollouts)
     advance(1)
+    return path
 
 
 def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool = True) -> None:
-    """Check that a folder holds no rollouts but those of a description.
+    """Check that a folder holds only the rollouts of a description.
 
     Args:
         folder: Folder of the rollouts; may be missing.
         identity: Description of the work, by the names of its settings.
-        is_alone: False where other shares may be at work, whose description stands before their first rollouts do.
+        is_alone: False where other shares may be at work, with a description and no rollouts yet.
 
     Raises:
-        ConfigError: Rollouts of another model or other settings, or a share that makes such.
+        ConfigError: Rollouts of a second model or other settings, or a share that makes such rollouts.
         DataError: A damaged description.
     """
     path = folder / ABOUT

@@ -1,11 +1,10 @@
-"""Logged scenarios to measure on: those of a split, or by id, of a converted data set or of tfrecord files."""
+"""Logged scenarios to measure on: of a split, or by id, of a converted data set or of tfrecord files."""
 
 import hashlib
 import io
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig
@@ -22,53 +21,17 @@ _HEADER_BYTES = 12
 _CACHED_SCENARIOS = 2  # each is read once
 
 
-@runtime_checkable
-class ScenarioSource(Protocol):
-    """Scenarios by id; can be handed to other processes."""
-
-    @property
-    def fingerprint(self) -> str:
-        """Hash of the contents."""
-        ...
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the data sources."""
-        ...
-
-    @property
-    def guessed(self) -> tuple[str, ...]:
-        """Values that are guessed in some scenarios, see `Scenario.guessed`."""
-        ...
-
-    def __contains__(self, scenario_id: object) -> bool: ...
-
-    def __len__(self) -> int: ...
-
-    def by_id(self, scenario_id: str) -> Scenario:
-        """One scenario.
-
-        Raises:
-            DataError: it is not there, or its bytes are damaged.
-        """
-        ...
-
-    def find_cluster(self, scenario_id: str) -> str | None:
-        """Label of a scenario's street network or recording; None where that is not known."""
-        ...
-
-
 def open_held_out(
     data: str | PathLike[str] | ScenarioDataset, config: EvaluateConfig
 ) -> tuple[ScenarioDataset, EvaluateConfig]:
-    """The scenarios to measure on, and the settings with their split.
+    """The scenarios to measure on, and the settings with the split.
 
     Args:
-        data: data set's folder, or "synthetic", or an opened data set, whose split then replaces that of the settings.
-        config: settings.
+        data: Data set's folder, or "synthetic", or an opened data set, whose split replaces the settings' split.
+        config: Settings of the measurement, with the split.
 
     Raises:
-        DataError: no such data set.
+        DataError: No such data set.
     """
     if isinstance(data, ScenarioDataset):
         config = replace(config, split=data.split)
@@ -77,72 +40,38 @@ def open_held_out(
 
 
 def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
-    """Positions of the scenarios to evaluate: all, or the first ones up to the limit.
+    """Positions of the scenarios to evaluate: all, or the first up to the limit.
 
     Args:
-        dataset: the scenarios of the split.
-        config: settings with the limit.
+        dataset: Scenarios of the split.
+        config: Settings with the limit.
 
     Raises:
-        DataError: none, or one without its future.
+        DataError: No scenario, or a scenario without a future.
     """
-    chosen = range(min(len(dataset), config.limit or len(dataset)))
-    place = f"{dataset.folder}" + (f" (split {dataset.split})" if dataset.split else "")
-    if not chosen:
-        raise DataError(f"{place} has no scenarios: nothing to evaluate.")
+    positions = range(min(len(dataset), config.limit or len(dataset)))
+    title = f"{dataset.folder}" + (f" (split {dataset.split})" if dataset.split else "")
+    if not positions:
+        raise DataError(f"{title} has no scenarios: nothing to evaluate.")
     steps = dataset.index["num_steps"].to_pylist()
-    short = [i for i in chosen if steps[i] < TOTAL_STEPS]
+    short = [i for i in positions if steps[i] < TOTAL_STEPS]
     if short:
         raise DataError(
-            f"{place}: {len(short)} of {len(chosen)} scenarios withhold their future, the first is "
+            f"{title}: {len(short)} of {len(positions)} scenarios withhold their future, the first is "
             f"{dataset.scenario_ids[short[0]]} with {steps[short[0]]} steps: a test split can be simulated but not "
             "evaluated, use training or validation data."
         )
-    return chosen
+    return positions
 
 
 def hash_manifest(folder: Path) -> str:
-    """SHA-256 of a data set's manifest, which lists the checksums of all its files: equal for moved data sets."""
+    """SHA-256 of a data set's manifest, which lists the checksums of all files: equal for moved data sets."""
     return hash_file(folder / MANIFEST)
 
 
-def open_scenarios(source: str | PathLike[str]) -> ScenarioSource:
-    """The scenarios of a converted data set's folder, or of tfrecords: a file, a folder or a glob.
-
-    Raises:
-        DataError: neither is there, or a record is damaged.
-    """
-    if (Path(source) / MANIFEST).is_file():
-        return ConvertedScenarios(Path(source))
-    return index_tfrecords(Path(source))
-
-
-class ConvertedScenarios:
-    """The scenarios of a data set's folder, of all splits."""
-
-    def __init__(self, folder: Path) -> None:
-        self._dataset = ScenarioDataset(folder, cache_size=_CACHED_SCENARIOS)
-        self.fingerprint = hash_manifest(folder)
-        self.sources, self.guessed = self._dataset.sources, self._dataset.guessed
-
-    def __contains__(self, scenario_id: object) -> bool:
-        return scenario_id in self._dataset
-
-    def __len__(self) -> int:
-        return len(self._dataset)
-
-    def by_id(self, scenario_id: str) -> Scenario:
-        """One scenario, see `ScenarioSource`."""
-        return self._dataset.by_id(scenario_id)
-
-    def find_cluster(self, scenario_id: str) -> str | None:
-        """Label of its street network or recording, see `ScenarioSource`."""
-        return self._dataset.find_cluster(scenario_id)
-
-
 @dataclass(frozen=True)
-class RecordPlace:
-    """Place of a record's bytes."""
+class RecordSpan:
+    """Location of a record's bytes."""
 
     file: Path
     offset: int
@@ -151,44 +80,68 @@ class RecordPlace:
 
 @dataclass(frozen=True, eq=False)
 class LoggedScenarios:
-    """The scenarios of tfrecord files; each is parsed when it is read."""
+    """The scenarios of tfrecord files, parsed one by one when read."""
 
-    places: dict[str, RecordPlace]
+    spans: dict[str, RecordSpan]
     fingerprint: str
     sources: tuple[str, ...] = ("womd",)
     guessed: tuple[str, ...] = ()
 
     def __contains__(self, scenario_id: object) -> bool:
-        return scenario_id in self.places
+        return scenario_id in self.spans
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.spans)
 
     def by_id(self, scenario_id: str) -> Scenario:
-        """One scenario, see `ScenarioSource`."""
-        if scenario_id not in self.places:
+        """The scenario of an id.
+
+        Raises:
+            DataError: An unknown id, or damaged bytes.
+        """
+        if scenario_id not in self.spans:
             raise DataError(f"no scenario {scenario_id!r} among {len(self)} logged ones")
-        place = self.places[scenario_id]
-        with place.file.open("rb") as file:
-            file.seek(place.offset)
-            data = file.read(place.length)
+        span = self.spans[scenario_id]
+        with span.file.open("rb") as file:
+            file.seek(span.offset)
+            data = file.read(span.length)
         try:
             return scenario_from_bytes(data)
         except DataError as error:
-            raise DataError(f"{place.file}: scenario {scenario_id}: {error}") from error
+            raise DataError(f"{span.file}: scenario {scenario_id}: {error}") from error
 
     def find_cluster(self, scenario_id: str) -> str | None:
-        """None: records do not say which recording they were cut from."""
+        """None: records do not name the recording."""
         return None
 
 
-def index_tfrecords(source: Path) -> LoggedScenarios:
-    """Find the scenarios of tfrecord files, checking every record's checksums but parsing none.
+ScenarioSource = ScenarioDataset | LoggedScenarios
+"""Scenarios by id; can be handed to worker processes."""
+
+
+def open_scenarios(source: str | PathLike[str]) -> ScenarioSource:
+    """The scenarios of a converted data set's folder, of all splits, or of tfrecords: a file, a folder or a glob.
 
     Raises:
-        DataError: no such files, or a damaged record (converting with errors skipped makes a data set of the others).
+        DataError: A missing source, or a damaged record.
     """
-    places: dict[str, RecordPlace] = {}
+    if (Path(source) / MANIFEST).is_file():
+        return ScenarioDataset(source, cache_size=_CACHED_SCENARIOS)
+    return index_tfrecords(Path(source))
+
+
+def hash_source(source: ScenarioSource) -> str:
+    """SHA-256 of a data set's manifest, or of the records of tfrecord files."""
+    return hash_manifest(source.folder) if isinstance(source, ScenarioDataset) else source.fingerprint
+
+
+def index_tfrecords(source: Path) -> LoggedScenarios:
+    """Index of the scenarios of tfrecord files, with every record's checksums checked and no record parsed.
+
+    Raises:
+        DataError: No such files, or a damaged record (a conversion that skips errors makes a data set of the others).
+    """
+    spans: dict[str, RecordSpan] = {}
     digest = hashlib.sha256()
     for path in find_tfrecords(source):
         # A record is length (8 bytes), checksum (4), data, checksum (4): its data begin after a header of 12 bytes.
@@ -198,10 +151,10 @@ def index_tfrecords(source: Path) -> LoggedScenarios:
             if scenario_id is None:
                 raise DataError(f"{path}: record {record}: not a WOMD Scenario message, it has no scenario_id")
             # of a scenario that occurs twice the first is taken, as by the converter
-            places.setdefault(scenario_id, RecordPlace(path, offset + _HEADER_BYTES, len(data)))
+            spans.setdefault(scenario_id, RecordSpan(path, offset + _HEADER_BYTES, len(data)))
             offset += len(data) + RECORD_OVERHEAD_BYTES
             digest.update(data)
-    return LoggedScenarios(places, digest.hexdigest())
+    return LoggedScenarios(spans, digest.hexdigest())
 
 
 def _find_scenario_id(record: bytes) -> str | None:

@@ -18,18 +18,11 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction
-from rlftsim.evaluation.results import (
-    SCORE_COLUMNS,
-    EvaluateConfig,
-    Evaluation,
-    Provenance,
-    Skipped,
-    row_of_result,
-)
+from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
-from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
@@ -82,9 +75,9 @@ def score_rollouts(
 ) -> Evaluation:
     """Score rollouts from files; every scenario's numbers are also written to `out/<name>.parquet`.
 
-    Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
+    Impossible rollouts, such as in a wrong frame, are scored with a warning that names scenario and agent.
 
-    Interrupted in any way, the same call goes on; once finished, it reads the result. Scenarios come in the order of
+    Interrupted in any way, the same call goes on; a finished result is read. Scenarios come in the order of
     the files, and in the order inside each file.
 
     Args:
@@ -97,7 +90,7 @@ def score_rollouts(
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: Files that cannot be read, agents that are not the scenario's, values that are no numbers or more
+        DataError: Files that cannot be read, agents of a different scenario, values that are no numbers or more
             than 1000 km from the origin, sets of different numbers of rollouts; under "error" also scenarios without
             road edges or unknown ones.
         ConfigError: A limit that would replace a stored result of more scenarios.
@@ -117,7 +110,7 @@ def score_rollouts(
         # of all, also under a limit: a quick look and the whole are of the same rollouts
         policy_fingerprint=hash_entries(all_entries),
         dataset=str(scenarios.absolute()),
-        manifest_sha256=source.fingerprint,
+        manifest_sha256=hash_source(source),
         sources=source.sources,
         guessed=source.guessed,
     )
@@ -125,7 +118,7 @@ def score_rollouts(
     result = resume_evaluation(
         f"score {name}",
         [entry.scenario_id for entry in entries],
-        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        partial(_score_entry, tuple(entries), source, config, num_rollouts),
         name=name,
         provenance=provenance,
         out=None if out is None else Path(out),
@@ -138,11 +131,11 @@ def score_rollouts(
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain values under the names of the official messages; None where there is no number.
+    """Plain values under the names of the official messages; None = no number.
 
     `{"metric", "sources", "guessed", "scenarios": [{"scenario_id", fields, "buckets"}], "mean": {fields, "buckets"},
     "standard_error": ...}`.
-    Means are over the scenarios that have a number; the standard error needs two of them.
+    Means are over the scenarios that have a number; the standard error needs two numbers.
     """
     metric = metric_by_name(evaluation.config.metric)
     rows = evaluation.table.to_pylist()
@@ -158,7 +151,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def format_scores(evaluation: Evaluation) -> Table:
-    """Every mean ± standard error with the metric's version beside it; arrows say which way is better."""
+    """Every mean ± standard error with the metric's version; arrows show the better direction."""
     metric = metric_by_name(evaluation.config.metric)
     title = f"{evaluation.name}: {len(evaluation)} scenarios, {evaluation.config.num_rollouts} rollouts each"
     table = Table(title=title, title_justify="left", caption=evaluation.data_note or None, caption_justify="left")
@@ -175,17 +168,6 @@ def format_scores(evaluation: Evaluation) -> Table:
             f"{label}{ARROWS[find_direction(column)]}", f"{mean.mean:.4f}", spread, str(mean.count), metric.name
         )
     return table
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Input of the work on a scenario; is handed to other processes."""
-
-    entries: tuple[RolloutEntry, ...]
-    source: ScenarioSource
-    config: ScoreConfig
-    num_rollouts: int
-    """Of the first scenario; all others must have as many."""
 
 
 def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, path: Path) -> None:
@@ -228,37 +210,39 @@ def hash_entries(entries: Sequence[RolloutEntry]) -> str:
     return digest.hexdigest()
 
 
-def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
-    """Row of one scenario, or why there is none."""
-    entry = job.entries[position]
-    if entry.scenario_id not in job.source:
+def _score_entry(
+    entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, num_rollouts: int, position: int
+) -> dict[str, object] | Skipped:
+    """Row of a scenario, or the reason for a missing row; all scenarios must have the same number of rollouts."""
+    entry = entries[position]
+    if entry.scenario_id not in source:
         return Skipped(entry.scenario_id, "not among the given scenarios")
-    scenario = job.source.by_id(entry.scenario_id)
+    scenario = source.by_id(entry.scenario_id)
     if not has_road_edge(scenario):
         skipped = Skipped(scenario.scenario_id, _NO_ROAD_EDGE)
-        _check_maps([skipped], job.config)
+        _check_maps([skipped], config)
         return skipped
     states = read_states(entry)
-    if states.num_rollouts != job.num_rollouts:
+    if states.num_rollouts != num_rollouts:
         raise DataError(
-            f"{entry}: {states.num_rollouts} rollouts, others have {job.num_rollouts}: the meta-metric depends on the "
+            f"{entry}: {states.num_rollouts} rollouts, others have {num_rollouts}: the meta-metric depends on the "
             "number, so a mean over both means nothing. Score them apart."
         )
     try:
-        result = score(scenario_log(scenario), states, metric_by_name(job.config.metric))
+        result = score(scenario_log(scenario), states, metric_by_name(config.metric))
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
     warn_of_doubts(scenario, states, entry.file)
-    return row_of_result(result, scenario, states, job.source.find_cluster(entry.scenario_id))
+    return row_of_result(result, scenario, states, source.find_cluster(entry.scenario_id))
 
 
 def has_road_edge(scenario: Scenario) -> bool:
-    """True if the map has a road edge of two points or more; without one the official metric is undefined."""
+    """True if the map has a road edge of two points or more; else the official metric is undefined."""
     return len(select_polylines(scenario.map_features, ROAD_EDGE_TYPES).count) > 0
 
 
 def _check_maps(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
-    """Under "error" nothing may be missing from the means, also where an earlier run left it out."""
+    """Check, under "error", that no scenario is missing from the means, also by the choice of an earlier run."""
     mapless = [scenario for scenario in skipped if scenario.reason == _NO_ROAD_EDGE]
     if mapless and config.missing_map == "error":
         raise DataError(

@@ -1,6 +1,6 @@
-"""Places of the fields of a serialized protobuf message, found without reading their contents.
+"""Locations of the fields of a serialized protobuf message, without reading the contents.
 
-A submission file holds the rollouts of hundreds of scenarios: listing them must not cost their memory.
+A submission file holds the rollouts of hundreds of scenarios: a list must not cost the memory of the rollouts.
 
     field = key, payload        key = varint(number << 3 | type)        type 2 = length, bytes
 """
@@ -19,7 +19,7 @@ MAX_FIELD_BYTES = 1 << 28
 
 
 class WireField(NamedTuple):
-    """One field of a message and the range of its payload in the file."""
+    """A field of a message and the range of the payload in the file."""
 
     number: int
     wire_type: int
@@ -27,8 +27,8 @@ class WireField(NamedTuple):
     stop: int
 
 
-class WholeField(NamedTuple):
-    """One field of a message with its bytes."""
+class FieldBytes(NamedTuple):
+    """A field of a message with all bytes."""
 
     number: int
     wire_type: int
@@ -37,15 +37,15 @@ class WholeField(NamedTuple):
     payload: bytes
 
 
-def read_fields(file: BufferedIOBase, size: int) -> Iterator[WholeField]:
+def read_fields(file: BufferedIOBase, size: int) -> Iterator[FieldBytes]:
     """Fields of a message, read front to back: for files that cannot be sought and messages larger than memory.
 
     Args:
-        file: at the message's first byte.
-        size: of the message in bytes.
+        file: File whose position is the first byte of the message.
+        size: Length of the message in bytes.
 
     Raises:
-        DataError: the bytes are no protobuf message, or end too early; names the byte.
+        DataError: Bytes that are no protobuf message, or end too early; names the byte.
     """
     position = 0
     while position < size:
@@ -67,7 +67,7 @@ def read_fields(file: BufferedIOBase, size: int) -> Iterator[WholeField]:
         payload = payload or file.read(length)
         if len(payload) < length:
             raise DataError(f"cut off: the field at byte {position} does not end")
-        yield WholeField(number, wire_type, head, payload)
+        yield FieldBytes(number, wire_type, head, payload)
         position += len(head) + length
 
 
@@ -77,12 +77,12 @@ def iterate_fields(file: BufferedIOBase, start: int, stop: int) -> Iterator[Wire
     See https://protobuf.dev/programming-guides/encoding.
 
     Args:
-        file: can be sought.
-        start: first byte of the message.
-        stop: byte after its last one.
+        file: File that can be sought; the position afterwards is undefined.
+        start: Position of the first byte of the message.
+        stop: Position after the last byte of the message.
 
     Raises:
-        DataError: the bytes are no protobuf message; names the byte.
+        DataError: Bytes that are no protobuf message; names the byte.
     """
     position = start
     while position < stop:
@@ -91,18 +91,13 @@ def iterate_fields(file: BufferedIOBase, start: int, stop: int) -> Iterator[Wire
         key = _read_varint(file, stop)
         number, wire_type = key >> 3, key & 7
         # only the place of the payload: its bytes are skipped
-        if wire_type == BYTES:
-            length = _read_varint(file, stop)
-            begin = file.tell()
-            end = begin + length
-        elif wire_type == VARINT:
-            begin = file.tell()
+        length = _read_varint(file, stop) if wire_type == BYTES else 0
+        begin = file.tell()
+        if wire_type == VARINT:
             _read_varint(file, stop)
-            end = file.tell()
-        else:
-            begin = file.tell()
-            # groups (3, 4) are in no message we know: their end lies beyond the stop, so they are refused below
-            end = begin + _FIXED_SIZE.get(wire_type, stop + 1)
+            length = file.tell() - begin
+        # groups (3, 4) are in no message we know: their end lies beyond the stop, so they are refused below
+        end = begin + (length if wire_type in (BYTES, VARINT) else _FIXED_SIZE.get(wire_type, stop + 1))
         if number == 0 or end > stop:
             raise DataError(f"not a protobuf message, or cut off: the field at byte {position} cannot be")
         yield WireField(number, wire_type, begin, end)
@@ -132,7 +127,7 @@ def _read_varint_bytes(file: BufferedIOBase, position: int) -> bytes:
 
 
 def _to_number(digits: bytes) -> int:
-    return sum((byte & 0x7F) << (7 * place) for place, byte in enumerate(digits))
+    return sum((byte & 0x7F) << (7 * position) for position, byte in enumerate(digits))
 
 
 def _endless(position: int) -> DataError:

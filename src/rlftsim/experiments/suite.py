@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError
-from rlftsim.evaluation.evaluate import EvaluateConfig, GoalsGiven, evaluate
-from rlftsim.evaluation.results import Evaluation
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.evaluation.results import Evaluation, GoalChoice
 from rlftsim.experiments.model_specs import BASE, CATK, GCSL, ROAD, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
 from rlftsim.experiments.rows import Row
 from rlftsim.experiments.stage_progress import Stage, run_stages
@@ -41,7 +41,7 @@ from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
 
-GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-logged-goals"}
+GOALS_SUFFIX: Mapping[GoalChoice, str] = {"none": "", "logged": "-logged-goals"}
 """End of the names of evaluations."""
 
 
@@ -104,7 +104,7 @@ class ExperimentSuite:
         config = self.recipe.finetune
         return Budget(config.num_updates(len(self.training)), config.batch_size, config.num_rollouts)
 
-    def evaluate(self, rows: Mapping[str, Sequence[ModelSpec]], *, goals: GoalsGiven = "none") -> dict[str, Row]:
+    def evaluate(self, rows: Mapping[str, Sequence[ModelSpec]], *, goals: GoalChoice = "none") -> dict[str, Row]:
         """Rows of a table by name; missing models are trained and evaluated.
 
         Args:
@@ -199,7 +199,7 @@ class ExperimentSuite:
         folder = self.out / "runs" / spec.name
         return folder if isinstance(spec, Base) else folder / f"{self._epochs(spec):g}-epochs"
 
-    def evaluation_name(self, spec: ModelSpec, goals: GoalsGiven = "none") -> str:
+    def evaluation_name(self, spec: ModelSpec, goals: GoalChoice = "none") -> str:
         """Name of the files with a model's results.
 
         Args:

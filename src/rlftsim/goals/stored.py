@@ -42,7 +42,12 @@ def write_goal_file(path: Path, goals: Mapping[str, Points]) -> None:
     write_atomically(path, lambda temporary: pq.write_table(table, temporary))
 
 
-def _read_goals(file: Path) -> pa.Table:
+def read_goal_file(file: Path) -> pa.Table:
+    """Table of a file that `write_goal_file` wrote.
+
+    Raises:
+        DataError: The file is damaged, or a row is not a goal.
+    """
     way_out = f"remove {file.parent} and write its goals again by `rlftsim augment`"
     table = read_parquet(file, way_out)
     try:
@@ -66,7 +71,7 @@ class StoredGoals:
         self._files = sorted(folder.glob("*.parquet"))
         if not self._files:
             raise DataError(f"{folder}: holds no goals: write them by `rlftsim augment`.")
-        tables = [_read_goals(file) for file in self._files]
+        tables = [read_goal_file(file) for file in self._files]
         self._table = pa.concat_tables([table.select(SCHEMA.names) for table in tables]).combine_chunks()
 
     @cached_property

@@ -1,6 +1,7 @@
 """Tensors and arrays from files that anybody may have written, damaged or edited.
 
-The only module that opens safetensors and npz files. Both announce sizes before their contents, and neither runs code.
+The only module that opens safetensors and npz files. Both formats announce sizes before contents, and neither runs
+code.
 """
 
 import math
@@ -31,15 +32,15 @@ _ARRAY_DAMAGE = (
 def read_tensors(
     path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError
 ) -> tuple[dict[str, Tensor], Mapping[str, str]]:
-    """Tensors of a safetensors file by name, on the CPU, and the texts in its header.
+    """Tensors of a safetensors file by name, on the CPU, and the texts in the header.
 
     Args:
-        path: Safetensors file; its header is checked against its size before any tensor is made.
+        path: Safetensors file; the header is checked against the size of the file before any tensor is made.
         remedy: Way out at the end of every message, such as "write it again".
         error: Class of the errors raised.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
+        FileNotFoundError: No such file; the caller names the file in the message.
         RlftsimError: Damaged file.
     """
     try:
@@ -54,17 +55,18 @@ def read_tensors(
 def read_npz(
     path: str | PathLike[str], names: Sequence[str], remedy: str, *, error: type[RlftsimError] = DataError
 ) -> dict[str, np.ndarray]:
-    """Arrays of an npz by name; names that it lacks are missing in the result.
+    """Arrays of an npz by name; names that the file lacks are missing in the result.
 
     Args:
         path: Npz file, packed or not.
-        names: Arrays to read; headers of all of them are looked at before the contents of any.
+        names: Arrays to read; all headers are checked before any contents are read.
         remedy: Way out at the end of every message, such as "write it again".
         error: Class of the errors raised.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
-        RlftsimError: No npz, damaged, an array of Python objects, or one that unfolds to more than `MAX_ARRAY_BYTES`.
+        FileNotFoundError: No such file; the caller names the file in the message.
+        RlftsimError: No npz, damaged, an array of Python objects, or an array that unfolds to more than
+            `MAX_ARRAY_BYTES`.
     """
     try:
         # numpy and Python warn of odd headers
@@ -87,7 +89,7 @@ def read_npz(
 
 
 def _read_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """Bytes of an array by its header, checked against those of its place in the archive.
+    """Bytes of an array by the header, checked against the bytes of the array's entry in the archive.
 
     Raises:
         ValueError: The array holds Python objects, or the two sizes differ.

@@ -1,6 +1,6 @@
-"""Data in buckets: `s3://`, `gs://`, `hf://`, `file://` and whatever else fsspec knows.
+"""Data in buckets: `s3://`, `gs://`, `hf://`, `file://` and further protocols of fsspec.
 
-Credentials are found by the libraries in their own ways; nothing here reads, keeps or prints them.
+Credentials are found by the libraries themselves; this module never reads, keeps or prints credentials.
 """
 
 import hashlib
@@ -55,7 +55,7 @@ def folder_address(url: str) -> str:
     """The address of a remote folder, without a slash at the end.
 
     Raises:
-        ConfigError: No address, or one without a bucket or path.
+        ConfigError: No address, or an address without a bucket or path.
     """
     if not is_url(url) or not url.partition("://")[2].strip("/"):
         raise ConfigError(f"{url} is no address of a folder: write one such as s3://bucket/folder.")
@@ -63,10 +63,10 @@ def folder_address(url: str) -> str:
 
 
 def check_writable(url: str) -> None:
-    """Check that an address is not one that data is only read from.
+    """Check that data may be written to an address.
 
     Raises:
-        ConfigError: The protocol is one of `READ_ONLY`.
+        ConfigError: The protocol is in `READ_ONLY`.
     """
     protocol = url.partition("://")[0]
     if protocol in READ_ONLY:
@@ -85,7 +85,7 @@ def validate_folder(folder: str | os.PathLike[str]) -> Path:
 
 
 def cache_folder() -> Path:
-    """Folder for what was fetched: RLFTSIM_CACHE, else ~/.cache/rlftsim."""
+    """Folder for fetched files: RLFTSIM_CACHE, else ~/.cache/rlftsim."""
     return Path(os.environ.get("RLFTSIM_CACHE", "~/.cache/rlftsim")).expanduser()
 
 
@@ -101,11 +101,11 @@ def local_copy(url: str, section: str) -> Path:
 
 @contextmanager
 def remote(url: str) -> Iterator[tuple[Any, str]]:
-    """File system of an address and the path in it; errors inside the block become one line that names the address.
+    """File system and path of an address; errors inside the block become a single line that names the address.
 
     Raises:
         ConfigError: The protocol is unknown, or the library for the protocol is not installed.
-        DataError: Nothing has this address, or the network or the permissions fail.
+        DataError: No file has this address, or the network or the permissions fail.
     """
     protocol = url.partition("://")[0]
     try:
@@ -163,7 +163,7 @@ def fetch(url: str, path: Path, sha256: str | None = None) -> str:
 
 
 def publish(path: Path, url: str) -> None:
-    """Copy a file to a bucket. Readers see all of it or nothing: an upload that is cut short leaves no object.
+    """Copy a file to a bucket. Readers see the whole file or none: an upload that is cut short leaves no object.
 
     Args:
         path: File of this machine that is copied.
@@ -188,12 +188,12 @@ def publish(path: Path, url: str) -> None:
 
 
 def put_text(url: str, text: str, *, is_new: bool) -> bool:
-    """Write a small remote file; returns False where it should be new and is not. Of several processes one creates it.
+    """Write a small remote file; False if `is_new` and the file exists. Of several processes one creates the file.
 
     Args:
         url: Address of the file.
         text: Content of the file, stored in UTF-8.
-        is_new: True leaves a file that has this address as it is.
+        is_new: True leaves an existing file with this address unchanged.
 
     Raises:
         DataError: The file cannot be written.
@@ -258,7 +258,7 @@ def fetch_shard(url: str, sha256: str) -> Path:
 
 
 def _evict(newest: Path) -> None:
-    """Remove the oldest shards of the cache above its limit. Processes that have one open keep it."""
+    """Remove the oldest shards of the cache above its limit. A process that has a shard open keeps the shard."""
     gigabytes = os.environ.get("RLFTSIM_CACHE_GB", "50")
     try:
         limit = float(gigabytes) * 1e9
@@ -281,7 +281,7 @@ def _evict(newest: Path) -> None:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Wait for a lock file, and hold it."""
+    """Wait for a lock file, and hold the lock."""
     with errors_name(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a")
@@ -296,11 +296,11 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def mirror(url: str, names: tuple[str, ...]) -> Path:
-    """Local folder with some files of a remote one, fetched again when the last of them has changed.
+    """Local folder with some files of a remote folder, fetched again when the last file has changed.
 
     Args:
         url: Address of the remote folder.
-        names: Names of the files, the last of which changes whenever another does, such as a manifest.
+        names: Names of the files, the last of which, such as a manifest, changes whenever any file does.
 
     Raises:
         DataError: A file is missing.
@@ -347,15 +347,15 @@ def find_files(url: str, pattern: str) -> dict[str, int]:
 def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
     """Hold a remote folder for the time of a block; yields a function to be called every few minutes meanwhile.
 
-    Buckets have no locks. So the owner and the time are in a file that only one process can create, and that counts
-    until it is removed, or was not renewed for `SECONDS_OF_SILENCE`.
+    Buckets have no locks. So the owner and the time are in a file that only a single process can create. The file
+    counts until removed, or until not renewed for `SECONDS_OF_SILENCE`.
 
     Args:
         url: Address of the folder, without a slash at the end.
         doing: Verb of the work, for messages: "is copying to".
 
     Raises:
-        NotYetError: Another process holds the folder, or took the folder over after a long silence of this process.
+        NotYetError: A second process holds the folder, or took the folder over after a long silence of this process.
         DataError: The folder cannot be written to.
     """
     lease_url = f"{url}/{REMOTE_LEASE}"

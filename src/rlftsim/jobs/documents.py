@@ -25,6 +25,8 @@ LONGEST_INTEGER = 40
 """Digits of a whole number: the seeds of numpy have 39."""
 LONGEST_NAME = 40
 """Characters of a name that a message repeats."""
+MAX_NAME_BYTES = 200
+"""Bytes of a text that becomes a file name; file systems take names of 255 bytes, and a suffix follows."""
 _TYPE_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 
 
@@ -46,8 +48,8 @@ def read_json(
         error: Class of the errors raised.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
-        RlftsimError: The file cannot be read, or `parse_json` refuses its text.
+        FileNotFoundError: No such file; the caller names the file in the message.
+        RlftsimError: The file cannot be read, or `parse_json` refuses the text.
     """
     text = _read_bytes(path, MAX_TEXT_BYTES, remedy, error)
     return parse_json(text, remedy, source=str(path), expected=expected, allow_nan=allow_nan, error=error)
@@ -67,14 +69,14 @@ def parse_json(
     Args:
         text: Whole text, bytes in UTF-8.
         remedy: Way out at the end of every message, such as "evaluate again".
-        source: File, and where in it the text stands, for messages.
+        source: File, and position of the text in the file, for messages.
         expected: Type of the outermost value; `object` takes all.
         allow_nan: True takes NaN and infinities, too, which are no JSON.
         error: Class of the errors raised.
 
     Raises:
-        RlftsimError: Damaged text, brackets nested too deeply, a name twice, a number out of range, or a value of
-            another type.
+        RlftsimError: Damaged text, brackets nested too deeply, a name twice, a number out of range, or a value of the
+            wrong type.
     """
 
     def parse_float(digits: str) -> float:
@@ -119,7 +121,7 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
         error: Class of the errors raised.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
+        FileNotFoundError: No such file; the caller names the file in the message.
         RlftsimError: The file cannot be read, is no TOML, or nests brackets too deeply.
     """
 
@@ -166,7 +168,7 @@ def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[
 
 
 def _parse(text: str | bytes, parse: Callable[[str], Any], source: str, remedy: str, error: type[RlftsimError]) -> Any:
-    """Parsed text, with every cause of failure in one line."""
+    """Parsed text; every cause of failure becomes an error of a single line."""
     try:
         decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
         value = parse(decoded)

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: under another name beside their own, then renamed."""
+"""Files that are written whole or not at all: under a temporary name in the same folder, then renamed."""
 
 import errno
 import json
@@ -29,7 +29,7 @@ _ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
 
 @contextmanager
 def errors_name(path: Path) -> Iterator[None]:
-    """Turn an error of the operating system, such as a full disk, into one line that names a path and the way out.
+    """Turn an error of the operating system, such as a full disk, into a line that names a path and the way out.
 
     Raises:
         DataError: in place of an OSError.
@@ -61,17 +61,18 @@ def cannot_write(path: Path, error: OSError) -> DataError:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then give it that name. A missing folder is created.
+    """Let `write` fill a temporary file beside `path`, then rename the file to `path`. A missing folder is created.
 
-    A symbolic link stays, and what it leads to is replaced. Devices and pipes stay, too: they get the finished bytes.
+    A symbolic link stays, and the target of the link is replaced. Devices and pipes stay, too, and receive the finished
+    bytes.
 
     Args:
         path: File that appears when the content is whole.
         write: Writer of the content, called with the path of the temporary file.
 
     Raises:
-        DataError: The file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
-            behind and an older file of this name is untouched.
+        DataError: The file cannot be written, such as on a full disk. Then, and after any other error, no temporary
+            file is left behind and an older file of this name is untouched.
     """
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     # Asked of the path: /dev/stdout leads to a pipe, which has no path of its own.
@@ -96,29 +97,29 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Name for a file until it is whole: of this process alone, on all machines that see the folder."""
+    """Name for a file that is not whole yet: unique to this process, on all machines that see the folder."""
     # Beside the file, as a rename is atomic within a file system only.
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
 
 
 def remove_temporaries(path: Path) -> None:
-    """Remove what killed processes left beside a file that they were writing. No process may be writing it now."""
+    """Remove temporary files that killed writers left beside a file. No process may be writing the file now."""
     for leftover in path.parent.glob(f".{escape(path.name)}.*.tmp"):
         leftover.unlink(missing_ok=True)
 
 
 def remove_temporaries_below(folder: Path) -> None:
-    """Remove what killed processes left anywhere in a folder, and nothing else. No process may be writing there now."""
+    """Remove temporary files of killed writers below a folder, and no other files. No process may be writing there."""
     for path in folder.rglob(".*.tmp"):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
 def remove_folder(folder: Path, names: Iterable[str]) -> None:
-    """Remove files of the given names and what killed processes left of them, then the folder if nothing else is in it.
+    """Remove files of the given names and the temporary files of killed writers, then the folder if empty.
 
     Args:
-        folder: May be missing. Files of other names, and folders in it, stay.
+        folder: May be missing. Files of other names, and inner folders, stay.
         names: Files that the caller has written there.
     """
     for name in names:
@@ -142,11 +143,11 @@ def write_text(path: Path, text: str) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """Add a text to the end of a file, in UTF-8. Unlike the others this may leave a part of it.
+    """Add a text to the end of a file, in UTF-8. Unlike `write_atomically` this may leave a part of the text.
 
     Args:
         path: File of lines, created if missing.
-        text: Whole lines, so that a reader can drop one that was cut short.
+        text: Whole lines, so that a reader can drop a line that was cut short.
 
     Raises:
         DataError: The file cannot be written, such as on a full disk.
@@ -184,7 +185,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
 
 
 def _sort_metadata(path: Path) -> None:
-    """Sort the metadata in the header of a safetensors file, whose order differs from process to process."""
+    """Sort the metadata in the header of a safetensors file: the order differs from process to process."""
     with path.open("r+b") as file:
         size = int.from_bytes(file.read(8), "little")
         header = parse_json(file.read(size), "write it again", source=str(path))

@@ -1,14 +1,15 @@
-"""Result folders: what a folder holds, which results may be written into it, and by whom.
+"""Result folders: the results in a folder, the results that may be written there, and the processes that may write.
 
-A folder is recognized by the files that it has anyway. Results are made by a single driver, or by the shares of a run:
-a lock refuses all others. A lock belongs to an open file, so it ends with the process that holds it, however that ends.
-Network file systems of today carry such locks between machines. On a file system without locks two drivers at a time
-are not noticed.
+A folder is recognized by the files of its results. Results are made by a single driver, or by the shares of a run: a
+lock refuses all other processes. A lock belongs to an open file, so the lock ends with the process that holds it,
+however that process ends. Network file systems of today carry such locks between machines. On a file system without
+locks two drivers at a time are not noticed.
 """
 
 import errno
 import json
 import os
+import re
 import socket
 import time
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from types import TracebackType
 from typing import Any, Literal, TextIO
 
 from rlftsim.errors import ConfigError, DataError, NotYetError, in_short
-from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.documents import MAX_NAME_BYTES, read_json
 from rlftsim.jobs.files import errors_name, write_text
 from rlftsim.jobs.runner import Runner, Share, Unfinished, check_begun
 
@@ -46,6 +47,8 @@ SECONDS_TO_WAIT = 10.0
 """A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
 WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 """Errors of file systems that have no locks, such as Lustre mounted without `flock`."""
+_OWNER = re.compile(r"^\S+ process \d+ since \d{4}-", re.MULTILINE)
+"""Beginning of the line that `describe_owner` writes. Shares write into one file, so others may precede or follow."""
 
 
 def recognize_folder(folder: Path) -> FolderType | None:
@@ -61,10 +64,10 @@ def check_folder(folder: Path, folder_type: FolderType) -> None:
 
     Args:
         folder: Folder of the results; may be missing, and may hold files of no result.
-        folder_type: Type of the results, which decides beside which others they may lie.
+        folder_type: Type of the results, which decides beside which other results new results may lie.
 
     Raises:
-        DataError: A file, the folder of another type of result, or a folder inside one.
+        DataError: A file, the folder of another type of result, or a folder inside a result folder.
     """
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{folder} is a file, not a folder: choose another folder.")
@@ -76,13 +79,13 @@ def check_folder(folder: Path, folder_type: FolderType) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Check that a file that a command is to write would replace none that a result folder consists of.
+    """Check that a file that a command is to write would not replace a file of a result folder.
 
     Args:
         path: File that the command is to write; need not exist.
 
     Raises:
-        DataError: The folder is recognized by this file, or is an inner one of a result.
+        DataError: The folder is recognized by this file, or is an inner folder of a result.
     """
     stored_type = recognize_folder(path.parent)
     if stored_type and path.exists() and any(path.name in names for names in MARKERS[stored_type]):
@@ -99,15 +102,15 @@ def check_name(name: str, meaning: str) -> None:
         meaning: Meaning of the name at the beginning of the message, such as "an evaluation's name".
 
     Raises:
-        ConfigError: An empty name, more than 200 bytes, or a slash, a line break or another control character.
+        ConfigError: An empty name, more than `MAX_NAME_BYTES`, or a slash, a line break or other control character.
     """
     is_file_name = name.strip() and name not in (".", "..") and not {*"/\\"} & {*name}
-    if not (is_file_name and name.isprintable() and len(name.encode()) <= 200):
+    if not (is_file_name and name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES):
         raise ConfigError(f"{meaning} becomes a file name, {in_short(name)} cannot: choose another name.")
 
 
 def _find_holder(folder: Path) -> str | None:
-    """The result folder, in words, that a folder is an inner one of."""
+    """The result folder, in words, that an inner folder belongs to."""
     try:
         folder = folder.resolve()
     except (OSError, RuntimeError):
@@ -120,7 +123,7 @@ def _find_holder(folder: Path) -> str | None:
 
 
 def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> list[str]:
-    """Names of the values by which stored results are known not to be of the same work; empty where nothing is stored.
+    """Names of the values by which stored results differ from this work; empty where no identity is stored.
 
     Args:
         path: JSON file that `write_identity` has written.
@@ -138,7 +141,7 @@ def write_identity(path: Path, identity: Mapping[str, Any]) -> None:
     """Store the values on which the results in a folder depend.
 
     Args:
-        path: JSON file in the folder; one that is there is replaced.
+        path: JSON file in the folder; an existing file is replaced.
         identity: Plain values by name.
 
     Raises:
@@ -148,20 +151,20 @@ def write_identity(path: Path, identity: Mapping[str, Any]) -> None:
 
 
 class Lease:
-    """The right to write into a folder; use it as a context manager.
+    """The right to write into a folder, as a context manager.
 
-    A share holds the folder together with other shares, and its own number alone.
+    A share holds the folder together with other shares, and the number of the share alone.
 
     Args:
         path: Lock file inside the folder, both made if missing.
-        runner: Runner of the work; shares of one count may work side by side.
+        runner: Runner of the work; shares of the same count may work side by side.
         doing: Verb of the work, for messages: "is converting to".
-        note: First line of the lock file, for people who find the file.
+        note: First line of the lock file, for readers of the file.
 
     Raises:
-        NotYetError: Another driver holds the folder; says which, and since when.
-        Unfinished: The work ended while a share waited for its turn, so nothing is left to do.
-        DataError: The folder cannot be written to.
+        NotYetError: A second driver holds the folder; says which, and since when.
+        Unfinished: The work ended while a share waited, so no items are left to do.
+        DataError: The folder cannot be written to, or holds a different file with the name of the lock.
     """
 
     def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
@@ -209,7 +212,7 @@ class Lease:
             title: Name of the work at the beginning of the message.
 
         Raises:
-            Unfinished: Other shares are at work; the last of them puts the result together.
+            Unfinished: Other shares are at work; the last share puts the result together.
         """
         if self._share is None:
             return
@@ -228,17 +231,18 @@ class Lease:
         remove_locks(self._path)
 
     def _lock(self, path: Path, *, is_shared: bool = False, deadline: float = 0.0, must_exist: bool = False) -> None:
-        """Open a file with a lock on it.
+        """Open a lock file and lock the file.
 
         Args:
             path: Lock file, made if missing.
             is_shared: True lets other processes have such a lock, too.
-            deadline: Moment at which waiting for another process ends, in seconds of `time.monotonic`.
+            deadline: Moment at which waiting for other processes ends, in seconds of `time.monotonic`.
             must_exist: True where the file was there: once gone, the work is done.
 
         Raises:
-            NotYetError: Another process has a lock.
-            Unfinished: Another process had a lock and has removed the file, at the end of all work.
+            NotYetError: A second process has a lock.
+            Unfinished: A second process had a lock and has removed the file, at the end of all work.
+            DataError: The file is no lock.
         """
         with errors_name(path):
             if not must_exist:
@@ -246,7 +250,7 @@ class Lease:
             while True:
                 try:
                     # A file that was there and is gone must not come back: its work is done.
-                    file = open(path, "r+" if must_exist else "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                    file = open(path, "r+" if must_exist else "a+", encoding="utf-8", errors="replace")  # noqa: SIM115
                 except FileNotFoundError:
                     if not must_exist:
                         raise
@@ -275,15 +279,18 @@ class Lease:
                     break
                 file.close()
             self._files.append(file)
+            text = f"{self._note}\n{describe_owner()}"
+            # A full disk may have kept the beginning alone.
+            if not (text.startswith(stored := _read_lock(file)) or _OWNER.search(stored)):
+                raise DataError(f"{path} is no lock of `rlftsim`: rename it, or choose another folder.")
             file.truncate(0)
-            file.write(f"{self._note}\n{describe_owner()}")
+            file.write(text)
             file.flush()
 
     def _refusal(self, file: TextIO) -> str:
         """Message with the owner and age of a lock."""
-        file.seek(0)
         try:
-            owner, age = parse_owner(file.read())
+            owner, age = parse_owner(_read_lock(file))
             whom = f" ({owner}, for {age})"
         except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
             whom = ""
@@ -291,9 +298,18 @@ class Lease:
 
 
 def remove_locks(path: Path) -> None:
-    """Remove a lock file and those of its shares, where the work has ended; missing files are no error."""
+    """Remove the lock files of finished work and of its shares; missing and other files are no error."""
     for lock in (*path.parent.glob(f"{path.name}.*-of-*"), path):
-        lock.unlink(missing_ok=True)
+        with suppress(FileNotFoundError), lock.open(encoding="utf-8", errors="replace") as file:
+            stored = _read_lock(file)
+            if not stored or _OWNER.search(stored):
+                lock.unlink()
+
+
+def _read_lock(file: TextIO) -> str:
+    """Text of a lock file, and the beginning of any other."""
+    file.seek(0)
+    return file.read(1 << 20)
 
 
 def describe_owner() -> str:
@@ -303,7 +319,7 @@ def describe_owner() -> str:
 
 
 def parse_owner(text: str) -> tuple[str, timedelta]:
-    """Process and age of the last line of a text, as `describe_owner` writes one.
+    """Process and age of the last line of a text, in the format of `describe_owner`.
 
     Raises:
         ValueError, TypeError: There is no such line.

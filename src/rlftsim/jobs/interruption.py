@@ -1,7 +1,7 @@
 """Signals that end a command: Ctrl-C, SIGTERM, and SIGUSR1, which SLURM sends before the time of a job is over.
 
-Each raises a KeyboardInterrupt in the main thread of the process that a user started, and in no process that this one
-started: it ends those.
+Each raises a KeyboardInterrupt in the main thread of the process that a user started, never in child processes: the
+main process ends its children.
 """
 
 import logging
@@ -35,9 +35,10 @@ def raise_interruption(number: int, *_: object) -> None:
 
 @contextmanager
 def signals_like_ctrl_c() -> Iterator[None]:
-    """Context in which SIGTERM and SIGUSR1 interrupt as Ctrl-C does, where they would end the process at once.
+    """Context in which SIGTERM and SIGUSR1 interrupt as Ctrl-C does, instead of ending the process at once.
 
-    Outside of the main thread, and where one is ignored or has a handler of the caller's, it stays as it is.
+    Outside of the main thread all signals stay unchanged, as does a signal that is ignored or has a handler of the
+    caller's.
     """
     is_main = threading.current_thread() is threading.main_thread()
     changed = [number for number in SIGNALS if is_main and signal.getsignal(number) is signal.SIG_DFL]
@@ -52,14 +53,14 @@ def signals_like_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def ctrl_c_waits(*, enabled: bool = True) -> Iterator[Callable[[], bool]]:
-    """Keep Ctrl-C back until the block ends, and raise it there; yields a function that is True once it was pressed.
+    """Hold Ctrl-C back until the block ends, and raise there; yields a function that is True once Ctrl-C was pressed.
 
-    So an update that has begun is finished, and the run can store it. A second Ctrl-C is raised at once. The same holds
-    for the signals that interrupt like it. Outside of the main thread, and where a signal is ignored or has a handler
-    of the caller's, all stays as it is.
+    So an update that has begun is finished, and the run can store the update. A second Ctrl-C is raised at once. The
+    same holds for the signals that interrupt like Ctrl-C. Outside of the main thread, and where a signal is ignored or
+    has a handler of the caller's, signals stay unchanged.
 
     Args:
-        enabled: False leaves all signals as they are.
+        enabled: False leaves all signals unchanged.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed.
@@ -92,10 +93,10 @@ def ctrl_c_waits(*, enabled: bool = True) -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def ctrl_c_blocked() -> Iterator[None]:
-    """Context in which Ctrl-C and the signals like it wait. Processes that are started in it never see them.
+    """Context in which Ctrl-C and similar signals wait. Processes started in the context never see these signals.
 
-    Ctrl-C reaches all processes of a terminal, SLURM's signals all of a job, but only the one that started the others
-    is to react, and ends them.
+    Ctrl-C reaches all processes of a terminal, SLURM's signals all of a job, but only the parent process is to react,
+    and ends its children.
     """
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:

@@ -1,19 +1,20 @@
-"""Lists of independent items whose results are kept in files: only what an earlier call left undone is done now.
+"""Lists of independent items with results in files: only items that an earlier call left undone are done now.
 
-It does not matter where an item is done, nor how often: the same item always writes the same file, whole or not at all.
+An item may be done anywhere, and more than once: the same item always writes the same file, whole or not at all.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
+from rlftsim.errors import DataError
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.processes import Advance, Task
-from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Runner, check_finished
+from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.runner import Runner, check_finished, select_items
 from rlftsim.jobs.threads import one_thread
 
 Item = TypeVar("Item")
@@ -24,11 +25,11 @@ Stored = TypeVar("Stored")
 
 
 class ResultFormat(ABC, Generic[Item, Stored]):
-    """Files that hold the results of items, one file each."""
+    """Files that hold the results of items, a file each."""
 
     @abstractmethod
     def read(self, item: Item) -> Stored | None:
-        """Stored result of an item; None for a missing or damaged file, or one of other work."""
+        """Stored result of an item; None for a missing or damaged file, or a file of other work."""
 
     def is_finished(self, item: Item) -> bool:
         """True if an item need not be done (again)."""
@@ -43,20 +44,42 @@ class ResultFormat(ABC, Generic[Item, Stored]):
         return str(item)
 
 
+def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
+    """Contents of a file that holds a result; None for a missing file, or for a damaged file, which a message names.
+
+    Args:
+        path: File of the result, which may be missing.
+        read: Reader of the file; raises a DataError for a damaged file.
+    """
+    if not path.exists():
+        return None
+    try:
+        return read(path)
+    except DataError as error:
+        log.warning(f"{path} has to be made again: {str(error).removeprefix(str(path)).lstrip(': ')}")
+        return None
+
+
 @dataclass(frozen=True, eq=False)
 class WholeFiles(ResultFormat[Item, Path]):
-    """A file for each item, which is there when it is whole; the file itself is the result."""
+    """A file for each item; the whole file is the result."""
 
     folder: Path
     name: Callable[[Item], str]
     """Name of an item's file, also in messages."""
+    contents: Callable[[Path], object]
+    """Reader of a file; raises a DataError for a damaged one."""
     units: Callable[[Item], int] | None = None
     """Units of progress that an item stands for; None = each item for a single unit."""
+    _whole: set[Path] = field(default_factory=set, init=False)
+    """Files that were read once, which is enough."""
 
     def read(self, item: Item) -> Path | None:
         """The file of an item, see `ResultFormat`."""
         path = self.folder / self.name(item)
-        return path if path.exists() else None
+        if path not in self._whole and read_stored(path, self.contents) is not None:
+            self._whole.add(path)
+        return path if path in self._whole else None
 
     def count_units(self, item: Item) -> int:
         """Value of `units`, see `ResultFormat`."""
@@ -98,7 +121,7 @@ def group_positions(num_items: int, items_per_file: int) -> list[range]:
 
 
 def group_task(work: Callable[[int], Result], format: GroupFormat[Any, Result]) -> Task:
-    """Task that does the scenarios of a group one after another and writes the file of the group.
+    """Task that does the scenarios of a group in turn and writes the file of the group.
 
     Args:
         work: Function from the position of a scenario to the result; must be picklable for other processes.
@@ -135,11 +158,11 @@ def run_items(
     unit: Literal["things", "bytes"] = "things",
     show_progress: bool = True,
 ) -> list[Stored]:
-    """Results of all items, in their order, once all are done; the lease is then this process's alone.
+    """Results of all items, in the items' order, once all are done; the lease is then this process's alone.
 
     Args:
         title: Name of the work, in front of the progress bar and at the beginning of messages.
-        items: Items over all shares, the finished ones included.
+        items: Items over all shares, finished items included.
         task: Work on an item, which writes the file; the returned value is the result, and None reads the file back.
         format: Files of the results, in a folder that all processes see.
         lease: Lock on that folder, which the shares of a run hold together.
@@ -148,11 +171,11 @@ def run_items(
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        SetAside: Items that ended their process again and again; all others are done.
-        Unfinished: The runner is a share, which is done, while others are not.
+        SetAside: Items that ended a process again and again; all other items are done.
+        Unfinished: The runner is a share, which is done, while other shares are not.
         NotYetError: Results are missing that other processes should have made, or that vanished meanwhile.
     """
-    selected = runner.select(range(len(items)))
+    selected = select_items(runner, range(len(items)))
     pending = [number for number in selected if not format.is_finished(items[number])]
     total, num_pending = (sum(format.count_units(items[n]) for n in numbers) for numbers in (selected, pending))
     with progress_bar(title, total, total - num_pending, unit=unit, show=show_progress) as advance, one_thread():

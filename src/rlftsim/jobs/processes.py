@@ -1,7 +1,7 @@
-"""Items of work in several processes of this machine, each with one thread.
+"""Items of work in several processes of this machine, each with a single thread.
 
-A process may be killed at any moment: no lock is shared, and a new process does the item again. An item whose process
-ends again and again is set aside.
+A process may be killed at any moment: no lock is shared, and a new process does the item again. An item that ends a
+process again and again is set aside.
 """
 
 import ast
@@ -44,7 +44,7 @@ OUT_OF_MEMORY = 137
 
 
 class SetAside(RlftsimError):
-    """Items that killed their worker processes again and again; all others are done."""
+    """Items that killed worker processes again and again; all other items are done."""
 
     exit_status = 1
 
@@ -63,9 +63,9 @@ def log_item(path: Path | None, name: str, seconds: float, machine: str) -> None
     """Add a line of JSON about a finished item to a file.
 
     Args:
-        path: Log file, created if missing; None writes nothing.
+        path: Log file, created if missing; None = no log.
         name: Name of the item, as in messages about a process that died.
-        seconds: Duration of the last attempt, from handing the item over to having its result.
+        seconds: Duration of the last attempt, from handing the item over to having the result.
         machine: Host name, or the address in a Ray cluster, of the machine that did the item.
 
     Raises:
@@ -78,7 +78,7 @@ def log_item(path: Path | None, name: str, seconds: float, machine: str) -> None
 
 
 def check_log(path: Path) -> None:
-    """Check that a file to which lines about items are to be added holds such lines, if it is there and not empty.
+    """Check that a file to which lines about items will be added holds such lines, or is missing or empty.
 
     Args:
         path: File of `log_item`; a device or pipe passes.
@@ -108,7 +108,7 @@ class Attempts:
         """Name of the item -> reason."""
 
     def retry(self, number: int, reason: str, *, is_to_blame: bool = True) -> None:
-        """Let an item wait again, before all others, or set it aside.
+        """Let an item wait again, before all other items, or set the item aside.
 
         Args:
             number: Index of the item in the list of all items.
@@ -127,16 +127,12 @@ class Attempts:
 
 @dataclass(frozen=True)
 class Processes:
-    """Several processes of this machine; they end with the process that started them."""
+    """Several processes of this machine, which end with the process that started them all."""
 
     jobs: int
     on_death: OnDeath = "skip"
     item_log: Path | None = None
     """See `log_item`."""
-
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """All items, see `Runner`."""
-        return items
 
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
@@ -210,11 +206,11 @@ def pickle_task(task: Task, dumps: Callable[[Task], bytes] = pickle.dumps) -> by
     """A task by value, for other processes.
 
     Args:
-        task: Function of an item, with everything that the work on any item needs: model, data set, settings.
+        task: Function of an item, with all data that the work on any item needs: model, data set, settings.
         dumps: Maker of bytes that `pickle.loads` reads, such as cloudpickle's for functions of the main module.
 
     Raises:
-        ConfigError: The task holds something that cannot be handed over.
+        ConfigError: The task holds an object that cannot be handed over.
     """
     try:
         # By value: torch's own way between processes shares memory through file descriptors, which run out.
@@ -224,7 +220,7 @@ def pickle_task(task: Task, dumps: Callable[[Task], bytes] = pickle.dumps) -> by
 
 
 class _Worker:
-    """A process and the line to it, at this end."""
+    """A process and this end of the line to that process."""
 
     def __init__(self) -> None:
         # Spawned, not forked: a forked process inherits locks of torch's threads and may wait for them forever.
@@ -262,7 +258,7 @@ class _Worker:
 
 
 def portable_error(error: Exception) -> Exception:
-    """The error that is being handled as another process can read it; a bug's has its traceback as a note."""
+    """The error that is being handled, in a form that other processes can read; a bug has the traceback as a note."""
     if not isinstance(error, RlftsimError):
         error.add_note(traceback.format_exc())
     try:
@@ -283,10 +279,10 @@ def _describe_end(status: int | None) -> str:
 
 
 def _check_main_guard() -> None:
-    """Check that no script starts processes at its top level: each of them would run the whole script again.
+    """Check that no script starts processes at the top level: each process would run the whole script again.
 
-    A spawned process imports the main module of the one that started it. Without the guard it comes to the same
-    call, and Python stops it there with a long traceback about its "bootstrapping phase".
+    A spawned process imports the main module of the process that started it. Without the guard the child comes to the
+    same call, and Python stops there with a long traceback about the "bootstrapping phase".
 
     Raises:
         ConfigError: The statement that is being executed is not guarded; names file and line.
@@ -344,7 +340,7 @@ def _work(line: Connection) -> None:
 
 
 def exit_with_parent() -> None:
-    """End this process when its parent is killed, so that no orphan writes beside the run that follows."""
+    """End this process when the parent process is killed, so that no orphan writes beside the run that follows."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

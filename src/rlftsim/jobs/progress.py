@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -19,6 +19,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
+
+from rlftsim.jobs.documents import printable
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200
@@ -26,7 +29,7 @@ FILE_WIDTH = 200
 
 
 class _StandardError(logging.StreamHandler):  # type: ignore[type-arg]
-    """Handler that looks up standard error at each message, because tests and notebooks replace it."""
+    """Handler that looks up standard error at each message, because tests and notebooks replace standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
         # The stream of the moment: the one at import may be closed by now.
@@ -42,10 +45,18 @@ if not log.handlers:
     log.propagate = False
 
 
+class _PlainConsole(Console):
+    """Console that shows a space in place of each control character of a text: names come from users' files."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text without control characters; lines stay lines."""
+        return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
+
+
 def print_wide(*tables: object) -> None:
-    """Print tables as wide as they need to be, or as the terminal. Brackets in their texts are not markup."""
+    """Print tables as wide as the terminal, or `FILE_WIDTH` wide in files. Brackets in texts are not markup."""
     width = None if Console().is_terminal else FILE_WIDTH
-    console = Console(width=width, markup=False, emoji=False)
+    console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
         console.print(table)
 
@@ -73,9 +84,9 @@ def progress_bar(
     Args:
         title: Name of the work, in front of the bar.
         total: Number of units in the whole work.
-        done: Number of units that an earlier run has finished; they do not count for the estimate of time.
+        done: Number of units that an earlier run has finished, which do not count for the estimate of time.
         unit: Unit of the numbers; bytes are shown as kB, MB or GB.
-        show: False prints nothing, neither a bar nor lines.
+        show: False prints neither a bar nor lines.
     """
     if not (show and sys.stderr.isatty()):
         yield _lines(title, total, done, show)

@@ -1,7 +1,7 @@
 """Work on a Ray cluster (the extra "ray"). No other module imports Ray.
 
-Ray starts processes on the machines of the cluster and notices which of them die. All else is as with `Processes`:
-items write their own files in a folder that all machines see, and an item whose process died is done again.
+Ray starts processes on the machines of the cluster and notices which processes die. All else is as with `Processes`:
+each item writes a file in a folder that all machines see, and an item is done again if the process died.
 """
 
 import hashlib
@@ -54,10 +54,10 @@ _tasks: dict[str, Task] = {}
 
 @dataclass(frozen=True)
 class RayRunner:
-    """Processes of a Ray cluster, one for each of its cores.
+    """Processes of a Ray cluster, a process per core.
 
     Args:
-        address: Address of the cluster, such as "10.0.0.1:6379"; "auto" = the one that runs on this machine.
+        address: Address of the cluster, such as "10.0.0.1:6379"; "auto" = the cluster that runs on this machine.
         on_death: "skip" sets an item aside that ended `ATTEMPTS` processes, "stop" raises at the first death.
         item_log: File that gets a line of JSON for each finished item; None = no such file.
     """
@@ -66,17 +66,13 @@ class RayRunner:
     on_death: OnDeath = "skip"
     item_log: Path | None = None
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """All items, see `Runner`."""
-        return items
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:
         """Results of all items, see `Runner`.
 
         Raises:
-            ConfigError: No such cluster, or one with another version of this package; see also `Runner`.
+            ConfigError: No such cluster, or a cluster with a different version of this package; see also `Runner`.
         """
         # Ray's pickle: processes of a cluster do not import the main module, in which a policy may be defined.
         pickled = pickle_task(task, cloudpickle.dumps)
@@ -116,7 +112,7 @@ class RayRunner:
         work = ray.remote(_work).options(num_cpus=1, memory=memory, max_retries=0, scheduling_strategy="SPREAD")
 
         def count(number: int, total: int) -> None:
-            """Report what an item has done since it was last counted."""
+            """Report the progress of an item since the last count."""
             advance(total - counted[number])
             counted[number] = total
 
@@ -163,7 +159,7 @@ class RayRunner:
 
 
 def _expected_memory(task_bytes: int) -> int:
-    """Bytes of memory that a process of the cluster is expected to need: no machine gets more of them than fit."""
+    """Bytes of memory that a process of the cluster is expected to need: no machine gets more processes than fit."""
     needed = BYTES_OF_A_PROCESS + BYTES_PER_BYTE_OF_A_TASK * task_bytes
     # Where even the largest machine has less, the work is tried all the same; Ray would wait for a larger one.
     has = [node["Resources"].get("memory", 0.0) for node in ray.nodes() if node["Resources"].get("CPU")]
@@ -171,7 +167,7 @@ def _expected_memory(task_bytes: int) -> int:
 
 
 class _Board:
-    """An actor that remembers what tasks at work report."""
+    """An actor that remembers the reports of tasks at work."""
 
     def __init__(self) -> None:
         self._totals: dict[int, int] = {}
@@ -198,7 +194,7 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
     version, folder = driver
 
     def advance(count: int) -> None:
-        """Add to the item's progress, and send it now and then."""
+        """Add to the item's progress, and send the sum now and then."""
         nonlocal total, last
         total += count
         if time.monotonic() - last > SECONDS_BETWEEN_REPORTS:
@@ -230,12 +226,12 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
 
 
 def _reason(error: RayError) -> str:
-    """First line of what Ray says about the end of a process."""
+    """First line of Ray's message about the end of a process."""
     return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
 
 
 def _cancel(refs: list[Any]) -> None:
-    """Stop tasks: at first they may clean up, then their processes are killed."""
+    """Stop tasks: at first tasks may clean up, then the processes are killed."""
     with suppress(RayError):
         for ref in refs:
             ray.cancel(ref)

@@ -1,11 +1,11 @@
-"""Independent items of work, done by whatever is there: this process, several, or one of many machines.
+"""Independent items of work, done by this process, by several processes, or by many machines.
 
     Inline()                this process
     Processes(4)            four processes of this machine (`rlftsim.jobs.processes`)
-    Share(3, 64, runner)    every 64th item, from the third on; other machines do the others (`--share 3/64`)
+    Share(3, 64, runner)    every 64th item, from the third on; other machines do the rest (`--share 3/64`)
     RayRunner("auto")       a Ray cluster (`rlftsim.jobs.ray`, the extra "ray")
 
-`Machines` and `Work` are the flags of commands that choose between them (docs/machines.md).
+`Machines` and `Work` are the flags of commands that choose between runners (docs/machines.md).
 """
 
 import math
@@ -25,7 +25,7 @@ CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 
 class Unfinished(RlftsimError):
-    """This share is done, and others are not."""
+    """This share is done, and other shares are not."""
 
     exit_status = 0
 
@@ -34,34 +34,30 @@ class Unfinished(RlftsimError):
 class Runner(Protocol):
     """Does independent items of work somewhere."""
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """The items that this runner does, of all items of the work; the others are another machine's."""
-        ...
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:
         """Call a task for every item; results in the items' order.
 
-        The first error, and Ctrl-C, stop all the others. A task that has to give up may return or raise as it likes.
+        The first error, and Ctrl-C, stop all other items. A task that has to give up may return or raise.
 
         Args:
-            task: Function of an item; must be picklable where other processes call it. Called again for an item whose
+            task: Function of an item; must be picklable where other processes call it. Called again for an item if the
                 process died.
-            items: Arguments of the calls, each independent of all others.
+            items: Arguments of the calls, each independent of all other calls.
             advance: Callback for the progress that tasks report, in units of the work; negative where a dead process
                 had reported some.
             describe: Name of an item in messages and in the log of finished items.
 
         Raises:
-            ConfigError: The task cannot be handed to another process, or a script calls this without the main guard.
-            SetAside: Some items ended their process again and again; raised when all others are done.
+            ConfigError: The task cannot be handed to another process, or a script has no main guard around this call.
+            SetAside: Some items ended a process again and again; raised when all other items are done.
         """
         ...
 
 
 def usable_cores() -> int:
-    """Cores this process may run on, within the quota of its container."""
+    """Cores this process may run on, within the quota of the container."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = (int(number) for number in CPU_QUOTA.read_text().split())
@@ -72,14 +68,10 @@ def usable_cores() -> int:
 
 @dataclass(frozen=True)
 class Inline:
-    """This process, one item after another."""
+    """This process, item by item."""
 
     item_log: Path | None = None
     """See `log_item`."""
-
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """All items, see `Runner`."""
-        return items
 
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
@@ -124,10 +116,6 @@ class Share:
     def __str__(self) -> str:
         return f"share {self.number}/{self.count}"
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """The items of this share, see `Runner`."""
-        return items[self.number - 1 :: self.count]
-
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:
@@ -137,19 +125,22 @@ class Share:
 
 @dataclass(frozen=True)
 class Joining(Inline):
-    """No item: only puts together what shares have made (`rlftsim join`)."""
+    """No item: only puts together the results of shares (`rlftsim join`)."""
 
-    def select(self, items: Sequence[Any]) -> Sequence[Any]:
-        """No items, see `Runner`."""
-        return items[:0]
+
+def select_items(runner: Runner, items: Sequence[Any]) -> Sequence[Any]:
+    """The items that a runner does, of all items of the work; other machines do the rest."""
+    if isinstance(runner, Share):
+        return items[runner.number - 1 :: runner.count]
+    return items[:0] if isinstance(runner, Joining) else items
 
 
 def choose_runner(jobs: int, num_items: int, on_death: OnDeath = "skip") -> Runner:
-    """Runner for a number of processes of this machine: this process where a single one is enough.
+    """Runner for a number of processes of this machine: this process where that is enough.
 
     Args:
-        jobs: Number of processes; more than `num_items` would have nothing to do and are not started.
-        num_items: Number of items in the whole work, the finished ones included.
+        jobs: Number of processes; at most `num_items` are started.
+        num_items: Number of items in the whole work, finished items included.
         on_death: "skip" sets an item aside that ended `ATTEMPTS` processes, "stop" raises at the first death.
     """
     jobs = min(jobs, num_items)
@@ -172,11 +163,12 @@ class Machines:
         """Runner of the flags; None = the verb's own choice of processes.
 
         Args:
-            jobs: Number of processes of this machine, for all items or for those of the share.
+            jobs: Number of processes of this machine, for all items or for the items of the share.
             on_death: "skip" sets an item aside that ended `ATTEMPTS` processes, "stop" raises at the first death.
 
         Raises:
-            ConfigError: A text that is no share, both flags, a log that is another file, or Ray is not installed.
+            ConfigError: A text that is no share, both flags, a log that is a file of other content, or Ray is not
+                installed.
         """
         if self.share is not None and self.ray is not None:
             raise ConfigError("--share and --ray are two ways to use several machines: choose one.")
@@ -194,7 +186,7 @@ class Machines:
 
 @dataclass(frozen=True)
 class Work(Machines):
-    """The same for a verb that reads no damaged files of its own."""
+    """The same flags for a verb that reads no damaged files."""
 
     on_error: OnDeath = "skip"
     """When a process dies three times at the same piece (out of memory, a crash): set that piece aside, do the others
@@ -207,10 +199,10 @@ class Work(Machines):
 
 
 def check_begun(runner: Runner, folder: Path) -> None:
-    """Check that there is something to put together, before a folder is made.
+    """Check that there are results to put together, before a folder is made.
 
     Args:
-        runner: Runner of the work; only `Joining` needs what others have made.
+        runner: Runner of the work; only `Joining` needs results of other processes.
         folder: Folder in which the shares store their results.
 
     Raises:
@@ -224,13 +216,13 @@ def check_finished(runner: Runner, num_missing: int, num_items: int, title: str)
     """Check that every item is done, before the result is put together.
 
     Args:
-        runner: Runner that has done its items.
+        runner: Runner that has done the selected items.
         num_missing: Number of items without a result in the folder.
         num_items: Number of items over all shares.
         title: Name of the work at the beginning of messages, such as "evaluate base".
 
     Raises:
-        Unfinished: This share is done, others are not.
+        Unfinished: This share is done, other shares are not.
         NotYetError: Results are missing that should be there.
     """
     if not num_missing:

@@ -1,7 +1,7 @@
 """Arrow tables from files that anybody may have written, damaged or edited.
 
-The only module that opens Parquet or Arrow files. Arrow trusts the offsets and lengths in them until a table is
-validated: a wrong one is followed out of the file, which ends the process.
+The only module that opens Parquet or Arrow files. Arrow trusts the offsets and lengths in a file until a table is
+validated: a wrong offset is followed out of the file, which ends the process.
 """
 
 from collections.abc import Mapping
@@ -17,6 +17,7 @@ MAX_VALUES = 1 << 27
 """Values that a Parquet file may hold, however small it is: 1 GiB of numbers."""
 MAX_VALUES_PER_BYTE = 100
 """Values a byte of a larger Parquet file; columns that hardly vary are packed far better than others."""
+_ARROW_BEGINNING = b"ARROW1\0\0"
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, pa.ArrowException)
 
 
@@ -29,13 +30,15 @@ def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimE
         error: Class of the errors raised.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
-        RlftsimError: Damaged file, text that is no UTF-8, a column twice, or more values than its size can explain.
+        FileNotFoundError: No such file; the caller names the file in the message.
+        RlftsimError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can
+            explain.
     """
     try:
         with pq.ParquetFile(path) as file:
             _check_size(file.metadata, stat(path).st_size)
-            return _validate_table(file.read())
+            # in batches: memory for as many values as a damaged column tells would be taken at once
+            return _validate_table(pa.Table.from_batches(file.iter_batches(), file.schema_arrow))
     except FileNotFoundError:
         raise
     except _DAMAGE as problem:
@@ -43,18 +46,29 @@ def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimE
 
 
 def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
-    """Validated table of an Arrow file, memory-mapped: its values are read when they are needed.
+    """Validated table of an Arrow file, memory-mapped: values are read when needed.
+
+    Batches are read from the checked messages, not from the positions that the end of the file announces.
 
     Args:
         path: Arrow file of a shard, which must not change while the table is in use.
         remedy: Way out at the end of every message.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
-        DataError: Damaged file, or text that is no UTF-8.
+        FileNotFoundError: No such file; the caller names the file in the message.
+        DataError: Damaged or compressed file, or text that is no UTF-8.
     """
     try:
-        return _validate_table(pa.ipc.open_file(pa.memory_map(fspath(path))).read_all())
+        file = pa.memory_map(fspath(path))
+        reader = pa.ipc.open_file(file)
+        file.seek(len(_ARROW_BEGINNING))
+        messages = [message for message in pa.ipc.MessageReader.open_stream(file) if message.type != "schema"]
+        if len(messages) != reader.num_record_batches:
+            raise ValueError(f"it has {len(messages)} batches, not {reader.num_record_batches}")
+        if any(map(_is_compressed, messages)):
+            raise ValueError("it is compressed, as this package writes no shard")
+        batches = [pa.ipc.read_record_batch(message, reader.schema) for message in messages]
+        return _validate_table(pa.Table.from_batches(batches, reader.schema))
     except FileNotFoundError:
         raise
     except _DAMAGE as problem:
@@ -77,7 +91,8 @@ def check_columns(table: pa.Table, schema: pa.Schema) -> None:
         schema: Names and types of all columns.
 
     Raises:
-        DataError: A column is missing, unknown, of another type or has an empty cell; the message begins with it.
+        DataError: A column is missing, unknown, of the wrong type or has an empty cell; the message begins with the
+            column.
     """
     missing = [name for name in schema.names if name not in table.schema.names]
     unexpected = [name for name in table.schema.names if name not in schema.names]
@@ -100,11 +115,32 @@ def _validate_table(table: pa.Table) -> pa.Table:
     return table
 
 
+def _is_compressed(message: pa.ipc.Message) -> bool:
+    """True for a record batch with compressed values, which would unfold in memory to a size that the file announces.
+
+    pyarrow does not say; `Message.header` and `RecordBatch.compression` are in Arrow's format/Message.fbs.
+    """
+    data = message.metadata.to_pybytes()
+
+    def read(start: int, size: int = 4) -> int:
+        return int.from_bytes(data[start : start + size], "little")
+
+    def find(table: int, number: int) -> int:
+        """Position of a table's field, 0 where left out: a FlatBuffer lists offsets before tables."""
+        offsets = table - int.from_bytes(data[table : table + 4], "little", signed=True)
+        entry = 4 + 2 * number
+        offset = read(offsets + entry, 2) if entry < read(offsets, 2) else 0
+        return table + offset if offset else 0
+
+    header = find(read(0), 2)
+    return find(header + read(header), 3) > 0
+
+
 def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:
     """Check that values can be in a file: a few bytes may announce as many as memory cannot hold."""
-    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    announced = sum(group.column(k).num_values for group in groups for k in range(group.num_columns))
-    announced = max(announced, metadata.num_rows * metadata.num_columns)
+    # not by the metadata of columns: a damaged one ends the process as soon as pyarrow looks at it
+    num_rows = sum(metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
+    announced = max(num_rows, metadata.num_rows) * metadata.num_columns
     if announced > max(MAX_VALUES, MAX_VALUES_PER_BYTE * num_bytes):
         raise ValueError(f"it announces {announced:.3g} values in {num_bytes} bytes")
 

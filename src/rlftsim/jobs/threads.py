@@ -1,4 +1,4 @@
-"""Use of the processor and of memory by this process: one thread, and freed memory kept."""
+"""Use of the processor and of memory by this process: a single thread, and freed memory that stays."""
 
 import ctypes
 import platform
@@ -11,10 +11,10 @@ KEPT_BYTES = 1 << 30
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep freed memory for the next allocation. Other C libraries stay as they are.
+    """Let glibc keep freed memory for the next allocation. Other C libraries stay unchanged.
 
-    By default it returns most of it to the system after every simulated step and gets it again page by page, which
-    takes up to a twelfth of a rollout or of an update.
+    By default glibc returns most memory to the system after every simulated step and gets pages again one at a time,
+    which takes up to a twelfth of a rollout or of an update.
     """
     if platform.libc_ver()[0] == "glibc":
         libc = ctypes.CDLL(None)
@@ -27,8 +27,8 @@ def keep_freed_memory() -> None:
 def one_thread() -> Iterator[None]:
     """Let torch compute with a single thread inside the block.
 
-    Rollouts consist of small steps, between which threads mostly wait for each other. And with one thread neither the
-    number of cores nor that of processes changes a result.
+    Rollouts consist of small steps, between which threads mostly wait for each other. With a single thread neither the
+    number of cores nor the number of processes changes a result.
     """
     import torch  # not at the top: `--help` does not need it and would wait seconds
 

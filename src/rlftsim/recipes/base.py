@@ -1,11 +1,11 @@
 """The contract of a recipe.
 
 A recipe holds every number of a model's way from fresh weights to the fine-tuned policy, a section for each
-stage. The command line shows each field of each section in `--help`, with its docstring, and takes it as a
-flag: `--finetune.learning-rate 1e-5`.
+stage. The command line shows each field of each section in `--help`, with the docstring, and takes values
+by flag: `--finetune.learning-rate 1e-5`.
 
-A recipe for another policy is a frozen dataclass that extends `Recipe` and a function that returns one. In the
-pyproject.toml of its package:
+A recipe for a new policy is a frozen dataclass that extends `Recipe`, and a function that returns an instance. In the
+pyproject.toml of the package:
 
     [project.entry-points."rlftsim.recipes"]
     cruise-small = "my_package.recipes:cruise_small"
@@ -35,7 +35,7 @@ SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl", "
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Sections that every policy has. A subclass adds `model`, the sizes of its policies, and whatever else it needs:
+    """Sections that every policy has. A subclass adds `model`, the sizes of the policies, and any further field:
     each field that is a dataclass is a section."""
 
     tokens: TokensConfig | None = None
@@ -58,24 +58,24 @@ class Recipe:
 
     @property
     def counterpart(self) -> str | None:
-        """Name of the recipe of another architecture to compare with, of about the same size; None = there is none."""
+        """Name of the recipe of a different architecture of about the same size, to compare with; None = none such."""
         return None
 
     def new_policy(self, vocabulary: Vocabulary | None) -> nn.Module:
         """A policy with fresh weights, drawn with the seed of pre-training (`torch.manual_seed(self.pretrain.seed)`).
 
         Args:
-            vocabulary: tokens built with the settings `tokens`; None where these are None.
+            vocabulary: Tokens built with the settings `tokens`; None where these are None.
         """
         raise ConfigError(
             f"{type(self).__name__} describes no new policy: take a recipe that does, or fine-tune an existing model."
         )
 
     def like(self, policy: Policy) -> "Recipe":
-        """The same recipe for policies of the architecture and sizes of an existing one.
+        """The same recipe for policies of the architecture and sizes of an existing policy.
 
         Raises:
-            ConfigError: this recipe makes no such policies.
+            ConfigError: A recipe that makes no such policies.
         """
         raise ConfigError(f"{type(self).__name__} describes no policy like a {type(policy).__name__}.")
 
@@ -85,25 +85,25 @@ class Recipe:
         return ()
 
     def train_further(self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()) -> Policy:
-        """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`.
+        """The policy that `rlftsim pretrain --init-from` trains: an existing policy, with this recipe's `free_fields`.
 
         Args:
-            policy: Existing policy, whose weights training starts from.
-            vocabulary: tokens in place of its own; None = it keeps them.
-            keep: classes whose tokens stay its own all the same, see `align_vocabulary`.
+            policy: Existing policy; training starts from the weights.
+            vocabulary: Tokens in place of the policy's; None = no change.
+            keep: Classes that stay with the policy's tokens, see `align_vocabulary`.
 
         Raises:
-            ConfigError: there is a vocabulary, and nothing that would use it.
+            ConfigError: A vocabulary for a policy without tokens.
         """
         if vocabulary is not None:
             raise ConfigError(f"a {type(policy).__name__} takes no other vocabulary: leave --vocabulary out.")
         return policy
 
     def with_goals(self) -> "Recipe":
-        """The same recipe for goal-conditioned fine-tuning: every agent's goal is its logged endpoint, the
+        """The same recipe for goal-conditioned fine-tuning: every agent's goal is the logged endpoint, the
         reward is `gcft`.
 
-        CAT-K and RoaD, if the recipe has them, then train the goal-conditioned weights alone.
+        CAT-K and RoaD, if in the recipe, then train the goal-conditioned weights alone.
         """
         # Goals that the recipe has chosen already stay: `with_goals` fills in what is off.
         finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft", hold_speed=False)
@@ -113,11 +113,11 @@ class Recipe:
         return replace(self, finetune=finetune, catk=catk, road=road)
 
     def with_section(self, name: str, section: Any) -> Any:
-        """The same recipe with a further section, such as the settings of another package's training method.
+        """The same recipe with a further section, such as the settings of an installed package's training method.
 
         Args:
             name: Name of the section, which no field of the recipe has.
-            section: Dataclass of settings, with the values that the recipe gives them.
+            section: Dataclass of settings, with the values of the recipe.
         """
         extended = make_dataclass(
             type(self).__name__, [(name, type(section))], bases=(type(self),), frozen=True, kw_only=True
@@ -136,6 +136,6 @@ class Recipe:
 
 
 def section_names(recipe: Recipe) -> tuple[str, ...]:
-    """Names of the sections of a recipe: the known ones in the order of their use, then its own."""
+    """Names of the sections of a recipe: `SECTIONS` in the order of use, then the further sections."""
     present = [entry.name for entry in fields(recipe) if is_dataclass(getattr(recipe, entry.name))]
     return tuple(sorted(present, key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)))

@@ -1,4 +1,4 @@
-"""README of a model folder: the origin of a model and the terms under which it may be used."""
+"""README of a model folder: the origin of a model and the terms of use."""
 
 import os
 import sys
@@ -16,9 +16,9 @@ def model_card(training: str, data: Path, num_scenarios: int, start: str | os.Pa
 
     Args:
         training: Words for the kind of training, such as "pre-trained".
-        data: folder of the data set; its license note is passed on.
-        num_scenarios: number of training scenarios.
-        start: model that training started from; its card is passed on, too.
+        data: Folder of the data set; the license note is passed on.
+        num_scenarios: Number of training scenarios.
+        start: Model that training started from; the card is passed on, too.
     """
     environment, dataset = describe_environment(), ScenarioDataset(data)
     note = guessed_note(dataset.sources, dataset.guessed)
@@ -34,11 +34,11 @@ def model_card(training: str, data: Path, num_scenarios: int, start: str | os.Pa
 
 
 def append_cards(card: str, models: Iterable[str | os.PathLike]) -> str:
-    """A card followed by those of the models that a model was made from: the terms of their data hold for it, too.
+    """A card followed by the cards of the models that a model was made from: the terms of all data hold.
 
     Args:
         card: Text of the new model's card, in Markdown.
-        models: shipped models, model folders or runs.
+        models: Shipped models, model folders or runs.
     """
     cards = {str(model): read_card(model) for model in models}
     return "\n".join([card, *(f"## Made from {name}\n\n{text}\n" for name, text in cards.items() if text)])

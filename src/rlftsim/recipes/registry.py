@@ -1,4 +1,4 @@
-"""Recipes by name, this package's and those of other packages."""
+"""Recipes by name, of this and all installed packages."""
 
 from collections.abc import Callable
 
@@ -24,10 +24,10 @@ RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
 
 
 def recipe_by_name(name: str) -> Recipe:
-    """The recipe of a name, this package's or another's.
+    """The recipe of a name, from this or any installed package.
 
     Raises:
-        ConfigError: unknown, with the nearest known names, or not a recipe.
+        ConfigError: An unknown name, with the nearest known names, or not a recipe.
     """
     # Registered functions come from other packages, so their result is checked.
     recipe = RECIPES.get(name)()

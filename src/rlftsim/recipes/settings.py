@@ -1,13 +1,10 @@
-"""Settings as text: a recipe printed with its documentation, and files of settings read back as flags."""
+"""Settings as text: a recipe printed with documentation, and files of settings read back as flags."""
 
-import ast
 import difflib
-import inspect
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -15,16 +12,17 @@ from typing import Any, get_type_hints
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.documents import read_json
 from rlftsim.recipes.base import SECTIONS, Recipe, section_names
+from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
 
 def recipe_as_json(recipe: Recipe) -> str:
-    """A recipe as JSON, a mapping for each section. `--config FILE` reads it back."""
+    """A recipe as JSON, a mapping for each section; `--config FILE` reads the file."""
     return json.dumps({name: to_plain(section) for name, section in list_sections(recipe).items()}, indent=1)
 
 
 def recipe_as_text(recipe: Recipe) -> str:
-    """A recipe with the documentation of every field as a comment above it, in the notation of YAML."""
+    """A recipe with the documentation of every field as a comment above, in the notation of YAML."""
     return "\n\n".join(
         "\n".join([f"# {summarize_docstring(type(section))}", f"{name}:", *_write_lines(section, "  ")])
         for name, section in list_sections(recipe).items()
@@ -32,17 +30,12 @@ def recipe_as_text(recipe: Recipe) -> str:
 
 
 def list_sections(recipe: Recipe) -> dict[str, Any]:
-    """Sections that a recipe has, by name, in the order of their use."""
+    """Sections that a recipe has, by name, in the order of use."""
     return {name: getattr(recipe, name) for name in section_names(recipe)}
 
 
-def summarize_docstring(documented: object) -> str:
-    """First sentence or line of a docstring."""
-    return (inspect.getdoc(documented) or "").partition("\n")[0]
-
-
 def _write_lines(section: Any, indent: str) -> Iterator[str]:
-    documentation = field_documentation(type(section))
+    documentation = read_field_texts(type(section))
     for field in fields(section):
         value = getattr(section, field.name)
         # A section without a docstring of its own is described by its class.
@@ -55,33 +48,17 @@ def _write_lines(section: Any, indent: str) -> Iterator[str]:
             yield f"{indent}{field.name}: {json.dumps(to_plain(value))}"
 
 
-def field_documentation(config: type) -> dict[str, str]:
-    """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
-    documentation: dict[str, str] = {}
-    for owner in reversed(config.__mro__):
-        if not is_dataclass(owner):
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
-        # A field's docstring is the string that follows it; at run time it is gone, so the source is read.
-        for statement, following in pairwise(body):
-            if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
-                continue
-            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
-                documentation[statement.target.id] = " ".join(str(following.value.value).split())
-    return documentation
-
-
 def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
-    """Settings of a file as flags of the command line, which checks their values.
+    """Settings of a file as flags of the command line, which checks the values.
 
     Args:
         path: JSON that `rlftsim recipe NAME --json` printed, or the config.json of a run.
-        recipe: gives the names and types that settings may have.
-        sections: sections whose settings are used; others in the file are skipped.
-        run_section: section that the config.json of a run belongs to.
+        recipe: Recipe with the names and types that settings may have.
+        sections: Sections that are used; further sections in the file are skipped.
+        run_section: Section that the config.json of a run belongs to.
 
     Raises:
-        ConfigError: the file cannot be read, or a setting is unknown (the nearest known name is in the message).
+        ConfigError: A file that cannot be read, or an unknown setting; the message has the nearest known name.
     """
     # 1. sections by name
     values = _read_mapping(path)
@@ -109,11 +86,10 @@ def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_secti
     # 3. values become words; tyro checks their types
     words: list[str] = []
     for name, value in values_by_name.items():
-        if name.partition(".")[0] not in sections:
-            continue
-        group, _, last = name.rpartition(".")
-        owner = attrgetter(group)(recipe)
-        words += flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
+        if name.partition(".")[0] in sections:
+            group, _, last = name.rpartition(".")
+            owner = attrgetter(group)(recipe)
+            words += flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
     return words
 
 
@@ -121,7 +97,7 @@ def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
     """A setting as words of the command line.
 
     Args:
-        name: dotted name, e.g. "finetune.kl.target".
+        name: Dotted name, e.g. "finetune.kl.target".
         value: Value in JSON: a number, a text, true, false, null or a list.
         is_switch: True = written `--name` or `--no-name`, without a value.
     """

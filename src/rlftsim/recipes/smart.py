@@ -1,4 +1,4 @@
-"""SMART models of several sizes, each with the numbers it is trained by. A variant calls one of these and
+"""SMART models of several sizes, each with the numbers of the training. A variant calls one of these and
 changes fields."""
 
 from collections.abc import Collection
@@ -26,7 +26,7 @@ from rlftsim.training.reference import KlConfig
 
 @dataclass(frozen=True, kw_only=True)
 class SmartRecipe(Recipe):
-    """Everything from the vocabulary to the fine-tuned SMART policy."""
+    """All settings from the vocabulary to the fine-tuned SMART policy."""
 
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
@@ -58,7 +58,7 @@ class SmartRecipe(Recipe):
         return SmartPolicy(self.model, vocabulary)
 
     def like(self, policy: Policy) -> "SmartRecipe":
-        """The same recipe for SMART policies of the sizes of an existing one.
+        """The same recipe for SMART policies of the sizes of an existing policy.
 
         Raises:
             ConfigError: the policy is no SMART policy.
@@ -72,22 +72,22 @@ class SmartRecipe(Recipe):
 
     @property
     def free_fields(self) -> tuple[str, ...]:
-        """Numbers and distances of neighbors, and what only training uses."""
+        """Numbers and distances of neighbors, and settings of training alone."""
         return self.model.free_fields
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()
     ) -> SmartPolicy:
-        """A policy with the sizes of this recipe and the weights of an existing one.
+        """A policy with the sizes of this recipe and the weights of an existing policy.
 
         Args:
-            policy: Existing SMART policy, whose weights training starts from.
-            vocabulary: tokens in place of its own, see `align_vocabulary`; None = it keeps them.
-            keep: classes whose tokens stay its own all the same.
+            policy: Existing SMART policy; training starts from the weights.
+            vocabulary: Tokens in place of the policy's, see `align_vocabulary`; None = no change.
+            keep: Classes that stay with the policy's tokens.
 
         Raises:
             CheckpointError: the weights are of other sizes.
-            ConfigError: there are more tokens than places for them, or each class has a head of its own.
+            ConfigError: More tokens than the policy can hold, or a separate head for each class.
         """
         assert isinstance(policy, SmartPolicy)
         if vocabulary is not None and policy.config.head_per_class:
@@ -112,7 +112,7 @@ class SmartRecipe(Recipe):
 
 
 def smart_tiny_rlftsim() -> SmartRecipe:
-    """The paper: SMART-tiny (7 M), pre-trained on WOMD for 32 epochs, fine-tuned for one."""
+    """The paper: SMART-tiny (7 M), pre-trained on WOMD for 32 epochs, fine-tuned for 1."""
     return SmartRecipe(model=replace(smart_tiny(), frequency_init="log_spaced"))
 
 
@@ -122,7 +122,7 @@ def smart_mini_rlftsim() -> SmartRecipe:
 
 
 def smart_nano_rlftsim() -> SmartRecipe:
-    """SMART-nano (1 M): fits one small GPU."""
+    """SMART-nano (1 M): fits a small GPU."""
     return SmartRecipe(
         model=replace(smart_nano(), frequency_init="log_spaced"),
         pretrain=PretrainConfig(batch_size=16),
@@ -187,7 +187,7 @@ def smart_demo_long() -> SmartRecipe:
 
 
 def smart_demo_quick() -> SmartRecipe:
-    """The demo's stages, each at the smallest size that still exercises it."""
+    """The demo's stages, each at the smallest size that is still a test."""
     recipe = smart_demo_rlftsim()
     return replace(
         recipe,

@@ -1,4 +1,4 @@
-"""TrafficBots models, each with the numbers it is trained by."""
+"""TrafficBots models, each with the numbers of the training."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ from rlftsim.training.reference import KlConfig
 
 @dataclass(frozen=True, kw_only=True)
 class TrafficBotsRecipe(Recipe):
-    """Everything from fresh weights to the fine-tuned TrafficBots policy, which has neither tokens nor goals."""
+    """All settings from fresh weights to the fine-tuned TrafficBots policy, which has neither tokens nor goals."""
 
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
@@ -41,7 +41,7 @@ class TrafficBotsRecipe(Recipe):
         """A TrafficBots policy with fresh weights, drawn with the seed of pre-training.
 
         Raises:
-            ConfigError: there is a vocabulary, and nothing that would use it.
+            ConfigError: A vocabulary, which no TrafficBots model uses.
         """
         if vocabulary is not None:
             raise ConfigError("a TrafficBots model has no vocabulary: leave --vocabulary out.")
@@ -49,7 +49,7 @@ class TrafficBotsRecipe(Recipe):
         return TrafficBotsPolicy(self.model)
 
     def like(self, policy: Policy) -> "TrafficBotsRecipe":
-        """The same recipe for TrafficBots policies of the sizes of an existing one.
+        """The same recipe for TrafficBots policies of the sizes of an existing policy.
 
         Raises:
             ConfigError: the policy is no TrafficBots policy.
@@ -63,22 +63,22 @@ class TrafficBotsRecipe(Recipe):
 
     @property
     def free_fields(self) -> tuple[str, ...]:
-        """Neighborhoods, exploration noise, and what only training uses."""
+        """Neighborhoods, exploration noise, and settings of training alone."""
         return self.model.free_fields
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()
     ) -> TrafficBotsPolicy:
-        """A policy with the sizes of this recipe and the weights of an existing one.
+        """A policy with the sizes of this recipe and the weights of an existing policy.
 
         Args:
-            policy: Existing TrafficBots policy, whose weights training starts from.
-            vocabulary: None, since the model has no tokens; anything else is refused.
-            keep: Classes whose tokens would stay; without effect here.
+            policy: Existing TrafficBots policy; training starts from the weights.
+            vocabulary: None, since the model has no tokens; a vocabulary is refused.
+            keep: Classes that would keep the tokens; without effect here.
 
         Raises:
             CheckpointError: the weights are of other sizes.
-            ConfigError: there is a vocabulary, and nothing that would use it.
+            ConfigError: A vocabulary, which no TrafficBots model uses.
         """
         assert isinstance(policy, TrafficBotsPolicy)
         further = self.new_policy(vocabulary)
@@ -87,7 +87,7 @@ class TrafficBotsRecipe(Recipe):
 
 
 def trafficbots_v15_rlftsim() -> TrafficBotsRecipe:
-    """The paper: TrafficBots V1.5 (7.9 M), pre-trained on WOMD for one epoch, fine-tuned for 12 000 updates."""
+    """The paper: TrafficBots V1.5 (7.9 M), pre-trained on WOMD for 1 epoch, fine-tuned for 12 000 updates."""
     return TrafficBotsRecipe(
         model=trafficbots_v15(),
         pretrain=PretrainConfig(

@@ -1,6 +1,6 @@
 """The way from a data set to trained policies: vocabulary, pre-training, fine-tuning by any method.
 
-Each stage does what is missing in its folder, and refuses the folder of another run.
+Each stage continues the work in a folder, and refuses the folder of a different run.
 """
 
 import shutil
@@ -22,7 +22,8 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.goals import not_conditioned
 from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.method import TrainingSettings, find_method
+from rlftsim.training.method import TrainingSettings
+from rlftsim.training.registry import find_method
 from rlftsim.training.run import train_policy
 
 CACHED_SCENARIOS = 4096
@@ -50,13 +51,13 @@ def open_training(data: Path) -> ScenarioDataset:
 
 
 def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path, *, origin: str) -> Vocabulary:
-    """The vocabulary in a file; built from the training scenarios where the file is missing or of another origin.
+    """The vocabulary in a file; built from the training scenarios for a missing file, or a file of a different origin.
 
     Args:
-        training: Training scenarios, whose motions are clustered.
+        training: Training scenarios; the motions are clustered.
         config: Settings of the clustering, such as the number of tokens.
         path: file to read, or to write.
-        origin: text that says what it was built from; stored with it.
+        origin: Text on the data and settings of the vocabulary; stored in the file.
     """
     if not path.exists() or Vocabulary.load(path).origin != origin:
         build_vocabulary(training, config, origin=origin)[0].save(path)
@@ -77,10 +78,10 @@ def pretrain_policy(
 
     Args:
         policy: such as `recipe.new_policy(vocabulary)`; trained in place.
-        training: Training scenarios of one data set, with their futures.
-        config: Settings of pre-training; a stored run resumes only with equal ones.
-        out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
-        start: name of the model whose weights the policy has, for the card; None = they are fresh.
+        training: Training scenarios of a single data set, with logged futures.
+        config: Settings of pre-training; a stored run resumes only with equal settings.
+        out: Folder of the run. A run that was stopped there is resumed, a finished run is not repeated.
+        start: Name of the model that gave the policy's weights, for the card; None = fresh weights.
         held_out: scenarios for validation, see `config.validation`.
 
     Raises:
@@ -106,16 +107,16 @@ def finetune_model(
 
     Args:
         base: model folder, or the folder of a run.
-        training: Training scenarios of one data set, with their futures.
+        training: Training scenarios of a single data set, with logged futures.
         config: settings: `FinetuneConfig` for a reward, `CatkConfig` for CAT-K, `GcslConfig` for imitation of the
-            model's own rollouts, relabelled with their endpoints as goals.
-        out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated; with a reward
+            model's own rollouts, relabelled with endpoints as goals.
+        out: Folder of the run. A run that was stopped there is resumed, a finished run is not repeated; with a reward
             and more epochs it is trained further.
         conditioning: goal conditioning to add to the base model first; None = as the base model is.
         held_out: scenarios for validation; CAT-K only, see `config.validation`.
 
     Raises:
-        CheckpointError: `out` holds a run with other settings or another base model.
+        CheckpointError: `out` holds a run with other settings or a different base model.
         ConfigError: the base model has no weights or other goal conditioning, or the method has no validation.
     """
     policy: Any = load_policy(str(base))
@@ -132,16 +133,16 @@ def finetune_model(
 
 
 def describe_method(config: object) -> str:
-    """The method of a fine-tuning in a few words, for the README of its model: by the type of its settings."""
+    """The method of a fine-tuning in a few words, for the README of the model: by the type of the settings."""
     method = find_method(config)
     return "" if method is None else method.describe(config)
 
 
 def prepare_policy(policy: Any, config: object) -> Any:
-    """Policy with the features of a calibration, their weights 0; the policy itself for other methods.
+    """Policy with the features of a calibration, all weights 0; for all other methods the policy unchanged.
 
     Args:
-        policy: Base model. One that has been calibrated with the same features goes on from its weights.
+        policy: Base model. A model that has been calibrated with the same features goes on from the weights.
         config: Settings of the method.
 
     Raises:
@@ -155,12 +156,12 @@ def prepare_policy(policy: Any, config: object) -> Any:
 
 
 def start_from_shorter_run(out: Path, epochs: float) -> None:
-    """Copy the end of the longest shorter run with a reward into a run that has not begun; nothing if there is none.
+    """Copy the end of the longest shorter run with a reward, if any, into a run that has not begun.
 
-    The longer run passes through the same weights, because nothing in it depends on the update at which it ends.
+    The longer run passes through the same weights, because no update depends on the length of the run.
 
     Args:
-        out: folder of the run to begin, beside the shorter ones; they are called "3-epochs".
+        out: folder of the run to begin, beside the shorter runs, which are called "3-epochs".
         epochs: length of the run to begin.
     """
 

@@ -37,7 +37,7 @@ class PointMass:
         """Zeros: the only possible decision has probability 1.
 
         Args:
-            decision: Decisions [*batch, event], not compared with the possible one.
+            decision: Decisions [*batch, event], not compared with the possible decision.
             sampling: Sampling of any temperature; `top_k` is refused, as in `sample`.
         """
         check_no_top_k(sampling)
@@ -113,8 +113,8 @@ class ConstantVelocity:
         Args:
             context: Context of the scenarios, from `encode`, shared by all rollouts.
             num_rollouts: Number N of simulations of each scenario, all in a single state.
-            goals: Goals of agents, ignored: a constant velocity follows none.
-            noise: Noise [B, N, A, 0], empty since nothing is drawn.
+            goals: Goals of agents, ignored: a constant velocity has no goals.
+            noise: Noise [B, N, A, 0], empty since no numbers are drawn.
         """
         states = (context.position, context.heading, context.velocity)
         return ConstantVelocityState(*(v[:, None].expand(-1, num_rollouts, *v.shape[1:]) for v in states))
@@ -124,7 +124,7 @@ class ConstantVelocity:
 
         Args:
             context: Context from `encode`, not used.
-            state: State before the decision; the velocity in it is the decision.
+            state: State before the decision, whose velocity is the decision.
         """
         return PointMass(state.velocity)
 

@@ -4,7 +4,7 @@
     print(report)
 
 Hand over scenarios with several kinds of agents, a map and, if possible, traffic lights: a violated rule shows only
-where it applies.
+where the rule applies.
 """
 
 import copy
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlftsim.errors import RlftsimError, place_of
+from rlftsim.errors import RlftsimError, locate_error
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.edge_scenes import (
@@ -118,7 +118,7 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         reference: Policy of the same architecture for KL divergences; None = a copy with perturbed weights.
 
     Returns:
-        One result per rule. A rule whose check raised an error counts as failed, with the error as detail.
+        A result per rule. A rule with an error in the check counts as failed, with the error as detail.
     """
     subject = _Subject(_copy_for_evaluation(policy), tuple(scenarios), reference)
     results = []
@@ -131,7 +131,7 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         except _Broken as error:
             outcome, detail = "failed", str(error)
         except Exception as error:  # whatever a policy raises is an outcome of the test
-            outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({place_of(error)})"
+            outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({locate_error(error)})"
         results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
     return CheckReport(type(policy).__name__, tuple(results))
 
@@ -305,12 +305,12 @@ def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], A
 
 
 def scored_log_probs_equal_sampled_ones(subject: _Subject) -> str:
-    """Scored log-probabilities equal the sampled ones."""
+    """Scored log-probabilities equal sampled log-probabilities."""
     return _check_scores(subject, subject.rollouts)
 
 
 def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) -> str:
-    """Scored log-probabilities equal the sampled ones where agents are forced for a while."""
+    """Scored log-probabilities equal sampled log-probabilities where agents are forced for a while."""
     rollouts = subject.with_forced
     assert rollouts.forced is not None
     offset = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
@@ -319,7 +319,7 @@ def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) ->
 
 
 def scored_log_probs_equal_sampled_ones_with_goals(subject: _Subject) -> str:
-    """Scored log-probabilities equal the sampled ones where agents have goals."""
+    """Scored log-probabilities equal sampled log-probabilities where agents have goals."""
     return _check_scores(subject, subject.with_goals)
 
 
@@ -353,7 +353,7 @@ def kl_from_itself_is_zero(subject: _Subject) -> str:
 
 
 def kl_from_another_policy_is_positive(subject: _Subject) -> str:
-    """The KL divergence from another policy is not negative, and somewhere positive."""
+    """The KL divergence from a second policy is not negative, and somewhere positive."""
     reference = subject.reference
     scored = subject.score(subject.batch, subject.rollouts)
     kl = scored.kl(subject.score(subject.batch, subject.rollouts, reference)).detach()
@@ -381,7 +381,7 @@ def entropy_matches_monte_carlo(subject: _Subject) -> str:
 
 
 def kl_matches_monte_carlo(subject: _Subject) -> str:
-    """The KL divergence from another policy is the mean log-ratio of draws."""
+    """The KL divergence from a second policy is the mean log-ratio of draws."""
     draws = _draw_decisions(subject)
     reference = _decide_first(subject, subject.reference)
     # KL(p || q) is the mean of log p - log q over draws from p
@@ -449,7 +449,7 @@ def _check_means(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
 
 
 def temperature_zero_is_deterministic(subject: _Subject) -> str:
-    """At temperature 0 every rollout is the same, twice, up to what is drawn once per rollout."""
+    """At temperature 0 every rollout is the same, twice, up to the draws made once per rollout."""
     first, second = (subject.simulate(subject.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
     if not subject.policy.initial_noise_size:
         repeated = first.position[:, :1].expand_as(first.position)
@@ -512,7 +512,7 @@ def _measure_replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
 
 
 def gradients_reach_all_trained_weights(subject: _Subject) -> str:
-    """Gradients of the score reach the trained weights and no frozen ones, and are finite."""
+    """Gradients of the score reach the trained weights and no frozen weights, and are finite."""
     weights = _back_propagate(subject, scale=1.0)
     gradients = {name: p.grad for name, p in weights.items() if p.grad is not None}
     # a gradient may be zero (no light in these scenarios), but never absent
@@ -595,7 +595,7 @@ def scores_are_invariant_to_rotation_and_translation(subject: _Subject) -> str:
 
 
 def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
-    """A scenario alone has the same scores as in a batch with a larger one, and the same rollouts."""
+    """A scenario alone has the same scores as in a batch with a larger scenario, and the same rollouts."""
     batch, gaps, distances = subject.batch, [], []
     if len(subject.scenarios) < 2:
         raise _NotApplicable("a single scenario was handed over")
@@ -650,7 +650,7 @@ def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
 
 
 def _select_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
-    """Rollouts of one scenario of a batch, without its padding."""
+    """Rollouts of a scenario of a batch, without padding."""
     names = ("position", "heading", "decision", "decision_mask", "log_prob")
     values = {name: getattr(rollouts, name)[b : b + 1, :, :num_agents] for name in names}
     return replace(rollouts, **values, draws=None if rollouts.draws is None else rollouts.draws[b : b + 1])

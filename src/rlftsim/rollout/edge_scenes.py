@@ -70,8 +70,8 @@ def without_future(scenario: Scenario) -> Scenario:
 def place_on_grid(scenario: Scenario) -> Scenario:
     """The same scenario at the world's origin, coordinates rounded to 5/4096 m (1.2 mm).
 
-    Such coordinates stay exact in float32 when they are turned by 90 degrees or by `EXACT_TURN_RAD` and shifted by some
-    hundreds of whole meters, so that scores of a policy differ by the policy's rounding alone.
+    Such coordinates stay exact in float32 when turned by 90 degrees or by `EXACT_TURN_RAD` and shifted by some hundreds
+    of whole meters, so that scores of a policy differ by the policy's rounding alone.
     """
     central = move_scenario(scenario, 0.0, (-float(scenario.origin[0]), -float(scenario.origin[1])))
 
@@ -130,7 +130,7 @@ def _with_late_agents(scenario: Scenario, step: int) -> Scenario:
 
 
 def _with_absent_agent(scenario: Scenario) -> Scenario:
-    """The scenario with one more track, without a single valid step."""
+    """The scenario with a further track, without a single valid step."""
     rows = np.append(np.arange(len(scenario.tracks.valid)), scenario.ego_index)
     tracks = _with_tracks(scenario, rows).tracks
     # a copy of the ego's track, with a new id

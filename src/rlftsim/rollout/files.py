@@ -1,4 +1,4 @@
-"""Rollouts as files: one npz a scenario, in the layout that `rlftsim score` and other tools read.
+"""Rollouts as files: an npz per scenario, in the layout that `rlftsim score` and other tools read.
 
 Keys: scenario_id, object_ids [A] int64, x y z heading [N, A, 80] float32, world frame.
 """
@@ -19,7 +19,7 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
 
     Args:
         folder: Folder of the files, created where it is missing.
-        batch: Scenarios that the rollouts continue, in the same order; they give ids, heights and the world frame.
+        batch: Scenarios that the rollouts continue, in the same order, with ids, heights and the world frame.
         rollouts: Simulated futures in the map frame. The height of an agent stays that of the current step.
 
     Returns:

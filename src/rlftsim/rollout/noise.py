@@ -1,4 +1,4 @@
-"""Uniform noise that depends on seed, scenario and rollout alone, not on the batch, its slices or the device."""
+"""Uniform noise that depends on seed, scenario and rollout alone, not on batch, slices or device."""
 
 import hashlib
 
@@ -22,8 +22,8 @@ def draw_noise(
     """Uniform float32 numbers in [0, 1) for every agent of every rollout; zeros for padding.
 
     Args:
-        batch: Scenarios whose ids and agent counts the noise depends on; it lies on the batch's device.
-        rollout_ids: Ids of the N rollouts; `range(8, 16)` gives what a draw of 16 would give as the last 8.
+        batch: Scenarios whose ids and agent counts the noise depends on. The noise lies on the batch's device.
+        rollout_ids: Ids of the N rollouts; `range(8, 16)` gives the last 8 of a draw of 16.
         seed: Seed of all streams; equal seeds give equal numbers.
         purpose: Name of the stream, such as "begin"; streams of different names are independent.
         per_agent: Numbers k per agent and rollout; 0 gives an empty tensor.

@@ -1,7 +1,7 @@
-"""The interface between a traffic model and everything else. To add a model, read this page and write a class.
+"""The interface between a traffic model and the rest of the package. To add a model, read this page and write a class.
 
 `Policy` is all that simulation, the metric and evaluation need: five methods and three numbers. Each protocol further
-down is optional and opens one more door:
+down is optional and opens a further door:
 
 | a policy that implements | can be |
 |---|---|
@@ -23,11 +23,11 @@ Differences from a classical policy API, each for a reason:
 
 * A policy holds weights only. States are values, so policy and reference can run side by side and rollouts can
   interleave.
-* Randomness is handed in as uniform noise, a few values for every (scenario, rollout, agent, decision), drawn from
-  the seed and the scenario's id (`rollout.noise`). So the same seed gives the same rollouts however a batch is
-  composed, sliced or moved between devices, and nothing random has to be stored to resume a run.
-* A batch holds the logged future, which training learns from. `encode` may not read it: rollouts are those of a test
-  split, in which tracks and lights end at the current step.
+* Randomness is handed in as uniform noise, a few values for every (scenario, rollout, agent, decision), drawn from the
+  seed and the id of the scenario (`rollout.noise`). So the same seed gives the same rollouts however a batch is
+  composed, sliced or moved between devices, and no random state has to be stored to resume a run.
+* A batch holds the logged future, which training learns from. `encode` may not read the future: rollouts are those of a
+  test split, in which tracks and lights end at the current step.
 
 A policy that is an nn.Module is used in these modes. `policies.registry.load_policy` returns evaluation mode with
 `requires_grad` False everywhere. Imitation of the log (pre-training, CAT-K) trains in `.train()`, so dropout is active.
@@ -59,7 +59,8 @@ class Sampling:
     """Temperature and truncation of the draws. RL samples with the defaults, so that the estimator is unbiased."""
 
     temperature: float = 1.0
-    """The density is raised to 1 / temperature; 0 takes the mode."""
+    """Below 1 likely decisions become likelier, as the density is raised to 1 / temperature; 0 always takes the most
+    likely one, of continuous actions the mean."""
     top_k: int | None = None
     """Keep only this many of the most likely decisions; None keeps all."""
 
@@ -80,17 +81,17 @@ class Sampling:
 
 @runtime_checkable
 class DecisionDistribution(Protocol):
-    """One independent distribution per leading element, float32, nats.
+    """An independent distribution per leading element, float32, nats.
 
-    Leading axes are [B, N, A] while simulating and [B, N, A, L] when scored.
-    `policies.distributions.TokenDistribution` is one for decisions that are token ids.
+    Leading axes are [B, N, A] while simulating and [B, N, A, L] when scored. `policies.distributions.TokenDistribution`
+    is for decisions that are token ids.
 
-    There may be a `mask` of the leading axes. Where False the agent decides nothing, such as padding or an agent
-    that has left the map: log-probability, KL and entropy are 0 there and left out of every mean.
+    There may be a `mask` of the leading axes. Where False the agent makes no decision, such as padding or an agent that
+    has left the map: log-probability, KL and entropy are 0 there and left out of every mean.
     """
 
     def sample(self, sampling: Sampling, noise: Float[Tensor, "... noise"]) -> Tensor:
-        """Draw decisions; no gradient flows through them.
+        """Draw decisions, without gradient.
 
         Args:
             sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
@@ -148,7 +149,7 @@ class StatisticsDistribution(Protocol):
 
 
 def compute_statistics(distribution: DecisionDistribution, decision: Tensor, reference: Any) -> DecisionStatistics:
-    """Statistics of any distribution, in one pass where it is a `StatisticsDistribution`.
+    """Statistics of any distribution, in one pass for a `StatisticsDistribution`.
 
     Args:
         distribution: Distribution of the policy that is trained.
@@ -214,8 +215,8 @@ class Policy(Protocol):
             context: Context of the scenarios, from `encode`, shared by all rollouts.
             state: State of N simulations before the decision, from `begin` or `advance`.
             decision: Decisions [B, N, A, *event].
-            forced: States [B, N, A, t] imposed from outside; None = none. An agent whose forced states are all valid
-                is put into these states, whatever was decided.
+            forced: States [B, N, A, t] imposed from outside; None = none. An agent whose forced states are all valid is
+                put into these states, whatever the decision.
         """
         ...
 
@@ -235,14 +236,14 @@ class Policy(Protocol):
 
 @runtime_checkable
 class SavedPolicy(Protocol):
-    """A model that can be written into a folder; `policies.checkpoint` does it in a line."""
+    """A model that can be written into a folder, as `policies.checkpoint` does in a line."""
 
     def save_pretrained(self, folder: Path, *, card: str = "") -> None:
         """Write the model into a folder.
 
         Args:
             folder: Folder of the model, created where it is missing.
-            card: Text of the folder's README.md, where training says what the model was trained with.
+            card: Text of the folder's README.md, where training describes the data and settings.
         """
         ...
 
@@ -263,7 +264,7 @@ class LoadablePolicy(Protocol):
     settings and the name of the class. That name is `architecture` of the very class, so the class may be moved or
     renamed. A class of nested settings, such as a dataclass in `self.config`, declares a name as
     `fingerprint_name: ClassVar[str]`; without that name the class is known by module and name, and cannot be moved. A
-    policy that holds another policy declares `fingerprint_parts: ClassVar[tuple[str, ...]]`, names of submodules whose
+    policy that holds a second policy declares `fingerprint_parts: ClassVar[tuple[str, ...]]`, names of submodules whose
     settings count as well.
     """
 
@@ -281,7 +282,7 @@ class PartlyTrainedPolicy(Protocol):
     """A policy with parts that fine-tuning leaves alone. Without this, all weights are trained."""
 
     def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
-        """Submodules to be trained by default; the others are frozen unless `trained="all"`."""
+        """Submodules to be trained by default; all other submodules are frozen unless `trained="all"`."""
         ...
 
 
@@ -312,7 +313,7 @@ class SharingPolicy(Policy, Protocol):
 
         Args:
             scenarios: Scenarios that `context` was encoded from, in the same order.
-            context: Context from any policy whose weights have not been changed since; None = nothing to take over.
+            context: Context from any policy whose weights have not been changed since; None = no features to take over.
         """
         ...
 
@@ -337,7 +338,7 @@ def encode_like(policy: Policy, scenarios: ScenarioBatch, context: Any) -> Any:
     Args:
         policy: Policy of any class that encodes the scenarios.
         scenarios: Scenarios that `context` was encoded from, in the same order.
-        context: Context from any policy whose weights have not been changed since; None = nothing to take over.
+        context: Context from any policy whose weights have not been changed since; None = no features to take over.
     """
     return policy.encode_like(scenarios, context) if isinstance(policy, SharingPolicy) else policy.encode(scenarios)
 
@@ -379,7 +380,7 @@ class TokenPolicy(Policy, Protocol):
 
 @runtime_checkable
 class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
-    """A policy with a weighted sum of named features on its token logits; `policies.calibrated` makes one of any other.
+    """A policy with a weighted sum of named features on the token logits; made of any policy by `policies.calibrated`.
 
     The distributions also have `base`, the distribution without the features, and `score_function(decision)`, the
     gradient [..., K] of the log-probability by the K weights.
@@ -395,7 +396,7 @@ class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
 
         Args:
             eta: Weights in the order of the features.
-            calibration: Table of what each feature earns, and measured changes.
+            calibration: Table of each feature's gain, and measured changes.
         """
         ...
 
@@ -430,7 +431,7 @@ class PretrainablePolicy(SavedPolicy, Protocol):
     """A model that learns to predict the next token along logged tracks."""
 
     def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
-        """Predictions of the next token of every agent at every step of its logged track.
+        """Predictions of the next token of every agent at every step of the logged track.
 
         Args:
             scenarios: Scenarios with logged futures, the targets of imitation.
@@ -464,14 +465,14 @@ class GoalConditionedPolicy(Policy, Protocol):
             scale: Factor of the pull towards goals, at least 0.
 
         Raises:
-            ConfigError: This model has nothing that could be scaled.
+            ConfigError: This model has no goal pull that could be scaled.
         """
         ...
 
 
 @runtime_checkable
 class ConditionablePolicy(Protocol):
-    """A policy that goal conditioning can be added to, before it is trained with goals."""
+    """A policy that goal conditioning can be added to, before training with goals."""
 
     def with_goal_conditioning(self, encoding: Any, *, logit_bias: bool | None = None) -> GoalConditionedPolicy:
         """Copy with fresh weights for goals, without effect yet; the same policy if conditioned in this way already.
@@ -481,7 +482,7 @@ class ConditionablePolicy(Protocol):
             logit_bias: True adds a goal-progress bias to the logits of decisions; None = the policy's default.
 
         Raises:
-            ConfigError: There is no such encoding, or the policy is conditioned in another way.
+            ConfigError: There is no such encoding, or the policy is conditioned in a different way.
         """
         ...
 
@@ -497,7 +498,7 @@ def get_device(policy: object) -> torch.device:
 
 
 def is_training(policy: object) -> bool:
-    """True for a module of which some part is in training mode, so that dropout may change its rollouts."""
+    """True for a module of which some part is in training mode, so that dropout may change rollouts."""
     return isinstance(policy, nn.Module) and any(module.training for module in policy.modules())
 
 
@@ -512,7 +513,7 @@ def is_goal_conditioned(policy: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ImitationLoss:
-    """Loss of imitation and metrics, summed over predictions: `training.imitation` divides by their number."""
+    """Loss of imitation and metrics, summed over predictions, the number of which `training.imitation` divides by."""
 
     loss: Float[Tensor, ""]
     """Sum, differentiable."""

@@ -1,7 +1,7 @@
 """Values of the elements of a mask, as rows, and back.
 
-Selecting rows by a mask makes the host wait for a device, which must count them first. Where all elements have a row,
-as on a device they do, both directions are views.
+Selecting rows by a mask makes the host wait for a device, which must count the rows first. Where all elements have a
+row, as on a device, both directions are views.
 """
 
 from functools import lru_cache
@@ -29,7 +29,7 @@ def _index_elements(shape: torch.Size, device: torch.device) -> tuple[Int64[Tens
 
 
 def pick_rows(values: Tensor, mask: Bool[Tensor, "*batch"], is_dense: bool) -> Tensor:
-    """Values of the elements whose mask is True, as rows [R, ...].
+    """Values of the elements with a True mask, as rows [R, ...].
 
     Args:
         values: Values of all elements, [*batch, ...].
@@ -43,7 +43,7 @@ def place_rows(rows: Tensor, mask: Bool[Tensor, "*batch"]) -> Tensor:
     """Rows at the True elements of a mask, [*batch, ...]; zeros elsewhere.
 
     Args:
-        rows: Values [R, ...] of the elements whose mask is True, or of all elements.
+        rows: Values [R, ...] of the elements with a True mask, or of all elements.
         mask: Elements with a row, in row-major order; only the shape is read if all elements have a row.
     """
     shape = (*mask.shape, *rows.shape[1:])

@@ -145,7 +145,7 @@ def check_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> 
 
 
 def _join_states(states: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:
-    """Imposed states of all steps; None where nothing was imposed at all."""
+    """Imposed states of all steps; None where no states were imposed."""
     if all(forced is None for forced in states):
         return None
     joined = AgentStates(path[..., :2].clone(), path[..., 2].clone(), torch.zeros_like(path[..., 0], dtype=torch.bool))

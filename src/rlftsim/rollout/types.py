@@ -95,7 +95,7 @@ class RolloutProvenance:
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """N simulated futures of each of B scenarios, with the decisions and their log-probabilities."""
+    """N simulated futures of each of B scenarios, with decisions and log-probabilities."""
 
     position: Float[Tensor, "B N A T 2"]
     heading: Float[Tensor, "B N A T"]
@@ -178,7 +178,7 @@ class Rollouts:
             scenario_id: Id of a simulated scenario; None stands for the only scenario.
 
         Raises:
-            ConfigError: There is no such agent (the message lists the simulated ones) or no such scenario.
+            ConfigError: There is no such agent (the message lists the simulated agents) or no such scenario.
         """
         row, ids = self.find_row(scenario_id), self.object_ids(scenario_id)
         assert self.provenance is not None

@@ -8,7 +8,7 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset
-from rlftsim.scenario.shards import check_shard
+from rlftsim.scenario.shards import check_scenario
 from rlftsim.scenario.types import Scenario, Scenarios
 
 Name: TypeAlias = str | os.PathLike[str]
@@ -21,29 +21,29 @@ def to_scenarios(scenarios: Any, split: str | None = "validation") -> Scenarios:
     """Scenarios by position, in whatever form they were handed over.
 
     Args:
-        scenarios: in any form.
-        split: opened of a data set that is given by its name; None = all.
+        scenarios: Scenario, list of scenarios, batch, data set, or the name of a data set.
+        split: Split that is opened of a data set handed over by name; None = all splits.
 
     Raises:
-        ConfigError: there is none, or something else was handed over.
-        DataError: no data set of this name, it has no such split, or a scenario that was made in Python is unsound.
+        ConfigError: No scenario, or a value of another type was handed over.
+        DataError: No data set of this name, or without this split, or a scenario made in Python is unsound.
     """
     # A string has a length and items too, so names are looked at first.
     if isinstance(scenarios, str | os.PathLike):
-        found: Any = open_dataset(scenarios, split)
+        sequence: Any = open_dataset(scenarios, split)
     elif isinstance(scenarios, Scenario):
-        found = (scenarios,)
+        sequence = (scenarios,)
     else:
-        found = scenarios.scenarios if isinstance(scenarios, ScenarioBatch) else scenarios
-    wanted = "hand over one, a list of them, a batch or a data set."
-    if not isinstance(found, Scenarios) or isinstance(found, Mapping):
-        raise ConfigError(f"{in_short(scenarios)}: not scenarios: {wanted}")
-    # A data set reads its scenarios from files, and has nothing else: they were checked when they were written.
-    items = () if isinstance(found, ScenarioDataset) else (found[position] for position in range(len(found)))
-    for one in items:
-        if not isinstance(one, Scenario):
-            raise ConfigError(f"{type(scenarios).__name__} with {in_short(one)}: not scenarios: {wanted}")
-        check_shard(one)
-    if not len(found):
+        sequence = scenarios.scenarios if isinstance(scenarios, ScenarioBatch) else scenarios
+    remedy = "hand over one, a list of them, a batch or a data set."
+    if not isinstance(sequence, Scenarios) or isinstance(sequence, Mapping):
+        raise ConfigError(f"{in_short(scenarios)}: not scenarios: {remedy}")
+    # Scenarios of a data set were checked when they were written.
+    for position in range(0 if isinstance(sequence, ScenarioDataset) else len(sequence)):
+        scenario = sequence[position]
+        if not isinstance(scenario, Scenario):
+            raise ConfigError(f"{type(scenarios).__name__} with {in_short(scenario)}: not scenarios: {remedy}")
+        check_scenario(scenario)
+    if not len(sequence):
         raise ConfigError("no scenario: hand over at least one.")
-    return found
+    return sequence

@@ -1,10 +1,10 @@
 """Argoverse 2 motion forecasting: a Parquet file of tracks and a JSON map for each scenario.
 
-Layout: `<split>/<uuid>/scenario_<uuid>.parquet` and `log_map_archive_<uuid>.json` beside it. A recording has 110 steps
-at 10 Hz, of which a window of 91 becomes a scenario. The test split has the first 50 only.
+Layout: `<split>/<uuid>/scenario_<uuid>.parquet` and `<split>/<uuid>/log_map_archive_<uuid>.json`. A recording has 110
+steps at 10 Hz, of which a window of 91 becomes a scenario. The test split has the first 50 only.
 
-The data have no box sizes and no heights of tracks: both are guessed, and `Scenario.guessed` says so. They have no
-lights, stop signs and speed limits: the scenarios have none.
+The data have no box sizes and no heights of tracks: both are guessed, and `Scenario.guessed` says so. Lights, stop
+signs and speed limits are missing in the data and in the scenarios.
 """
 
 import glob
@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import pyarrow as pa
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
+from rlftsim.scenario.rows import INTEGERS, NOTES, NUMBERS, TRUTHS, WORDS, Rows, read_rows
 from rlftsim.scenario.source import BytesRead, Item, Tally, Unit
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
@@ -44,59 +44,54 @@ WINDOWS: Mapping[str, tuple[tuple[int, int], ...]] = {
     "both": ((0, 91), (19, 110)),
     "av2": ((39, 110),),
 }
-"""First step of each window and the step after its last. That of "av2" has the data set's own current step, 49, and its
-60 future steps, which are too few for the realism meta-metric."""
+"""First step of each window and the step after the last. "av2" has the data set's current step, 49, and the 60
+future steps, which are too few for the realism meta-metric."""
 TEST_WINDOW = ((39, 50),)
-KINDS = {
+OBJECT_TYPES = {
     "vehicle": ObjectType.VEHICLE,
     "bus": ObjectType.VEHICLE,
     "pedestrian": ObjectType.PEDESTRIAN,
     "cyclist": ObjectType.CYCLIST,
     "motorcyclist": ObjectType.CYCLIST,
 }
-OTHER_KINDS = ("static", "background", "construction", "riderless_bicycle", "unknown")
+UNUSED_OBJECT_TYPES = ("static", "background", "construction", "riderless_bicycle", "unknown")
 """Left out, or `ObjectType.OTHER` with `keep_other`."""
-EGO, OTHER = "ego", "other"
+EGO, UNNAMED = "ego", "other"
 SIZES_M = {
     "vehicle": MEDIAN_SIZE_M[ObjectType.VEHICLE],
     "bus": (12.0, 2.9, 3.2),
     "pedestrian": MEDIAN_SIZE_M[ObjectType.PEDESTRIAN],
     "cyclist": MEDIAN_SIZE_M[ObjectType.CYCLIST],
     "motorcyclist": (2.1, 0.9, 1.7),
-    OTHER: OTHER_SIZE_M,
+    UNNAMED: OTHER_SIZE_M,
     EGO: (4.87, 1.85, 1.48),
 }
-"""Length, width and height where no file of sizes is given; for the ego those of the make of the recording vehicles."""
+"""Length, width and height where no file of sizes is given; the ego has the size of the recording vehicles."""
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 FOCAL, SCORED = 3, 2
-_COLUMNS = {
-    **dict.fromkeys(("track_id", "object_type", "scenario_id", "focal_track_id", "city", "slice_id"), str),
-    **dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), float),
-    **dict.fromkeys(("start_timestamp", "end_timestamp"), float),
-    **dict.fromkeys(("object_category", "timestep", "num_timestamps", "map_id"), int),
-    "observed": bool,
-}
-_NEEDED = [name for name in _COLUMNS if name not in ("city", "slice_id", "map_id", "focal_track_id")]
-_ARROW_KINDS = {
-    str: lambda kind: pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_null(kind),
-    float: lambda kind: pa.types.is_floating(kind) or pa.types.is_integer(kind),
-    int: lambda kind: pa.types.is_integer(kind),
-    bool: lambda kind: pa.types.is_boolean(kind),
-}
+_CUT_TRACKS = "tracks to predict not evaluated, as they leave the ground that the map covers"
+_NEEDED = (
+    dict.fromkeys(("track_id", "object_type", "scenario_id"), WORDS)
+    | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), NUMBERS)
+    | dict.fromkeys(("start_timestamp", "end_timestamp"), NUMBERS)
+    | dict.fromkeys(("object_category", "timestep", "num_timestamps"), INTEGERS)
+    | {"observed": TRUTHS}
+)
+_OPTIONAL = dict.fromkeys(("city", "slice_id", "focal_track_id"), NOTES) | {"map_id": NUMBERS}
 
 
 class Av2Source:
     """The data source "av2": Argoverse 2 motion forecasting.
 
     Args:
-        window: steps that become a scenario: "last" (19 to 109), "first" (0 to 90), "both" (two scenarios) or "av2" (39
+        window: Steps that become a scenario: "last" (19 to 109), "first" (0 to 90), "both" (two scenarios) or "av2" (39
             to 109, for displacement errors as in the literature; cannot be scored). Test scenarios give steps 39 to 49.
         keep_other: True keeps static objects and the like as objects of type OTHER.
-        sizes: JSON file with length, width and height in meters by kind, to use instead of `SIZES_M`:
+        sizes: JSON file with length, width and height in meters by object type, to use instead of `SIZES_M`:
             {"bus": [11.5, 2.6, 3.1]}.
 
     Raises:
-        ConfigError: an unknown window, or a file of sizes that is none.
+        ConfigError: An unknown window, or a file that holds no sizes.
     """
 
     license_note = (
@@ -116,13 +111,13 @@ class Av2Source:
         self.sizes = SIZES_M if sizes is None else {**SIZES_M, **_read_sizes(Path(sizes))}
 
     def detects(self, path: str | os.PathLike[str]) -> bool:
-        """True where at least one scenario has its map beside it."""
-        return any(_parse_map(file).exists() for file in find_files(path))
+        """True where at least 1 scenario has a map in the same folder."""
+        return any(_find_map(file).exists() for file in find_files(path))
 
     def find(self, path: str | os.PathLike[str]) -> list[Unit]:
         """One unit for the scenarios of a folder whose ids begin with the same two characters.
 
-        So a whole split becomes 256 shards, and a scenario that is added later changes one of them.
+        So a whole split becomes 256 shards, and a scenario that is added later changes a single shard.
         """
         files = find_files(path)
         if not files:
@@ -130,18 +125,18 @@ class Av2Source:
         groups = defaultdict(list)
         for file in files:
             split = file.absolute().parent.parent.name
-            groups[(split, _read_id(file)[:2])].append(file)
+            groups[(split, _parse_id(file)[:2])].append(file)
         return [
             Unit(
                 f"{split}/{start}" if split in SPLITS else start,
-                tuple(part for file in group for part in (file, _parse_map(file)) if part.exists()),
+                tuple(path for file in group for path in (file, _find_map(file)) if path.exists()),
                 SPLITS.get(split, "unknown"),
             )
             for (split, start), group in sorted(groups.items())
         ]
 
     def read(self, unit: Unit) -> Iterator[Item]:
-        """The scenarios of a unit by id, those that cannot be used with their cause."""
+        """Scenarios of a unit by id, and the cause for each that cannot be used."""
         record = 0
         for file in (file for file in unit.files if file.suffix == ".parquet"):
             try:
@@ -149,21 +144,19 @@ class Av2Source:
                     yield scenario
                     record += 1
                     if num_cut:
-                        yield Tally(
-                            "tracks to predict not evaluated, as they leave the ground that the map covers", num_cut
-                        )
+                        yield Tally(_CUT_TRACKS, num_cut)
             except DataError as error:
-                yield SkippedRecord(_read_id(file), record, str(error))
+                yield SkippedRecord(_parse_id(file), record, str(error))
                 record += 1
-            yield BytesRead(sum(part.stat().st_size for part in (file, _parse_map(file)) if part.exists()))
+            yield BytesRead(sum(path.stat().st_size for path in (file, _find_map(file)) if path.exists()))
 
     def describe(self) -> dict[str, object]:
-        """Guessed sizes, what is missing, and the settings."""
+        """Guessed and missing values, and the settings."""
         return {
             "av2": {
                 "guessed": ["size", "z"],
                 "missing": ["lights", "stop signs", "speed limits"],
-                "sizes_m": {kind: list(size) for kind, size in self.sizes.items()},
+                "sizes_m": {name: list(size) for name, size in self.sizes.items()},
                 "window": self.window,
                 "keep_other": self.keep_other,
             }
@@ -172,45 +165,41 @@ class Av2Source:
 
 def find_files(path: str | os.PathLike[str]) -> list[Path]:
     """Parquet files of scenarios at a path, by id: a file, a folder with its subfolders, or a glob of either."""
-    places = [Path(path)] if os.path.exists(path) else [Path(name) for name in glob.glob(str(path), recursive=True)]
-    found = {
-        file
-        for place in places
-        for file in (place.rglob("scenario_*.parquet") if place.is_dir() else [place])
-        if file.name.startswith("scenario_") and file.suffix == ".parquet"
-    }
-    return sorted(found, key=lambda file: (_read_id(file), str(file)))
+    paths = [path] if os.path.exists(path) else glob.glob(str(path), recursive=True)
+    matches = [match for path in map(Path, paths) for match in (path.rglob("*") if path.is_dir() else [path])]
+    files = {file for file in matches if file.name.startswith("scenario_") and file.suffix == ".parquet"}
+    return sorted(files, key=lambda file: (_parse_id(file), str(file)))
 
 
 def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int]]:
-    """The windows of a recording as scenarios, and how many tracks to predict were left out of each.
+    """Windows of a recording as scenarios, and how many tracks to predict were left out of each.
 
     Such a track leaves the ground that the map covers where the map is cut out of the city's: nearby road edges would
-    make it off-road, which it is not.
+    wrongly make the track off-road.
 
     Args:
-        file: Parquet file of a scenario; its map is beside it.
-        source: window and sizes.
+        file: Parquet file of a scenario, with the map in the same folder.
+        source: Data source whose window and sizes are used.
 
     Raises:
-        DataError: a file is missing or damaged, not of the published schema, or has impossible values.
+        DataError: A file is missing or damaged, not of the published schema, or has impossible values.
     """
-    columns = _read_columns(file)
-    num_steps = _count_steps(file, columns)
-    if not _parse_map(file).exists():
-        raise DataError(f"{file.name}: there is no {_parse_map(file).name} beside it")
-    map_features, ground = read_map(_parse_map(file))
+    rows = _read_rows(file)
+    num_steps = _count_steps(rows)
+    if not _find_map(file).exists():
+        raise DataError(f"{file.name}: there is no {_find_map(file).name} beside it")
+    map_features, ground = read_map(_find_map(file))
     windows = WINDOWS[source.window] if num_steps == RECORDED_STEPS else TEST_WINDOW
-    whole, category, ego = _read_tracks(file, columns, num_steps, source, ground)
+    recording, category, ego = _read_tracks(rows, num_steps, source, ground)
     for first, end in windows:
         suffix = f"-{first}" if len(windows) > 1 else ""
-        scenario_id = f"{columns['scenario_id'][0]}{suffix}"
-        yield _cut_window(scenario_id, whole, category, ego, slice(first, end), map_features, ground)
+        scenario_id = f"{rows['scenario_id'][0]}{suffix}"
+        yield _cut_window(scenario_id, recording, category, ego, slice(first, end), map_features, ground)
 
 
 def _cut_window(
     scenario_id: str,
-    whole: Tracks,
+    recording: Tracks,
     category: np.ndarray,
     ego: int,
     window: slice,
@@ -218,19 +207,10 @@ def _cut_window(
     ground: Ground,
 ) -> tuple[Scenario, int]:
     """Scenario of some steps of a recording, see `read_scenario`."""
-    valid = whole.valid[:, window]
-    kept = np.flatnonzero(valid.any(1))
-    tracks = Tracks(
-        object_id=whole.object_id[kept],
-        object_type=whole.object_type[kept],
-        position=whole.position[kept][:, window],
-        heading=whole.heading[kept][:, window],
-        velocity=whole.velocity[kept][:, window],
-        size=whole.size[kept][:, window],
-        valid=valid[kept],
-    )
-    category, own = category[kept], np.flatnonzero(kept == ego)
-    if not len(own) or not tracks.valid[own[0], CURRENT_STEP]:
+    indices = np.flatnonzero(recording.valid[:, window].any(1))
+    tracks = recording.select(indices).cut(window)
+    category, ego_indices = category[indices], np.flatnonzero(indices == ego)
+    if not len(ego_indices) or not tracks.valid[ego_indices[0], CURRENT_STEP]:
         raise DataError(f"the ego (track AV) is not there at the current step ({window.start + CURRENT_STEP})")
     predicted, num_cut = [], 0
     for track in np.flatnonzero((category >= SCORED) & tracks.valid[:, CURRENT_STEP]):
@@ -244,10 +224,8 @@ def _cut_window(
         timestamps_s=np.round(np.arange(tracks.valid.shape[1]) * STEP_S, 1),
         tracks=tracks,
         map_features=map_features,
-        lights=LightStates(
-            np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32)
-        ),
-        ego_index=int(own[0]),
+        lights=LightStates.of([]),
+        ego_index=int(ego_indices[0]),
         tracks_to_predict=np.array(predicted, np.int32),
         difficulty=np.zeros(len(predicted), np.int8),
         objects_of_interest=tracks.object_id[category == FOCAL],
@@ -257,146 +235,128 @@ def _cut_window(
     return scenario, num_cut
 
 
-def _read_columns(file: Path) -> dict[str, np.ndarray]:
-    """Columns of a Parquet file, all of the published schema and of its types."""
+def _read_rows(file: Path) -> Rows:
+    """Rows of a Parquet file of the published schema."""
     try:
         table = read_parquet(file, "get the file again")
     except FileNotFoundError:
         raise DataError(f"{file.name} is missing: get the file again") from None
-    names = [name for name in table.schema.names if not name.startswith("__index_level_")]
-    unknown = [name for name in names if name not in _COLUMNS]
-    missing = [name for name in _NEEDED if name not in names]
-    if unknown or missing:
-        cause = f"the unknown column {unknown[0]}" if unknown else f"no column {missing[0]}"
-        raise DataError(f"{file.name} has {cause}: its schema is not the published one")
-    if not table.num_rows:
+    try:
+        for name in table.schema.names:
+            if name not in _NEEDED | _OPTIONAL and not name.startswith("__index_level_"):
+                raise DataError(f"{file.name} has the unknown column {name}")
+        rows = read_rows(file.name, table, _NEEDED, _OPTIONAL)
+    except DataError as error:
+        raise DataError(f"{error}: its schema is not the published one") from None
+    if not len(rows):
         raise DataError(f"{file.name} has no rows")
-    columns = {}
-    for name in names:
-        column = table[name]
-        if not _ARROW_KINDS[_COLUMNS[name]](column.type):
-            raise DataError(f"{file.name}: column {name} is {column.type}: its schema is not the published one")
-        if column.null_count and name in _NEEDED:
-            raise DataError(f"{file.name}: column {name} has empty values")
-        columns[name] = column.to_numpy()
-    return columns
+    return rows
 
 
-def _count_steps(file: Path, columns: Mapping[str, np.ndarray]) -> int:
+def _count_steps(rows: Rows) -> int:
     """Number of recorded steps, 110, or 50 where the future is withheld."""
     for name in ("scenario_id", "num_timestamps", "start_timestamp", "end_timestamp"):
-        if (columns[name] != columns[name][0]).any():
-            raise DataError(f"{file.name}: {name} must be the same in all rows")
-    announced = int(columns["num_timestamps"][0])
-    step = columns["timestep"]
+        if (rows[name] != rows[name][0]).any():
+            raise DataError(f"{rows.table}: {name} must be the same in all rows")
+    announced = int(rows["num_timestamps"][0])
+    step = rows["timestep"]
     num_steps = int(step.max()) + 1
     allowed = (RECORDED_STEPS, OBSERVED_STEPS)
     if announced not in allowed or num_steps not in allowed or num_steps > announced:
-        found = announced if announced not in allowed else num_steps
-        wanted = f"{RECORDED_STEPS} ({OBSERVED_STEPS} in the test split)"
-        raise DataError(f"{file.name} has {found} steps instead of {wanted}")
-    if step.min() < 0:
-        raise DataError(f"{file.name}: row {int(step.argmin())} has the timestep {int(step.min())}")
-    wrong = np.flatnonzero(columns["observed"] != (step < OBSERVED_STEPS))
-    if len(wrong):
-        raise DataError(f"{file.name}: row {wrong[0]} contradicts itself: timestep {step[wrong[0]]}, observed "
-                        f"{columns['observed'][wrong[0]]}")  # fmt: skip
+        num_rejected = announced if announced not in allowed else num_steps
+        allowed_text = f"{RECORDED_STEPS} ({OBSERVED_STEPS} in the test split)"
+        raise DataError(f"{rows.table} has {num_rejected} steps instead of {allowed_text}")
+    rows.check(step < 0, "timestep is {}", step)
+    is_contrary = rows["observed"] != (step < OBSERVED_STEPS)
+    rows.check(is_contrary, "the row contradicts itself: timestep {}, observed {}", step, rows["observed"])
     # the grid is exactly 0.1 s, so the ends must be as far apart as the number of steps says
-    seconds, expected = (columns["end_timestamp"][0] - columns["start_timestamp"][0]) / 1e9, (announced - 1) * STEP_S
+    seconds, expected = (rows["end_timestamp"][0] - rows["start_timestamp"][0]) / 1e9, (announced - 1) * STEP_S
     if not abs(seconds / expected - 1) <= 0.01:
-        raise DataError(f"{file.name}: {announced} steps last {seconds:.3f} s instead of {expected:.1f} s")
+        raise DataError(f"{rows.table}: {announced} steps last {seconds:.3f} s instead of {expected:.1f} s")
     return num_steps
 
 
-def _read_tracks(
-    file: Path, columns: Mapping[str, np.ndarray], num_steps: int, source: Av2Source, ground: Ground
-) -> tuple[Tracks, np.ndarray, int]:
-    """Tracks of all steps in the order of the file, their categories, and the index of the ego."""
-    names, first_row, owner = np.unique(columns["track_id"].astype(str), return_index=True, return_inverse=True)
+def _read_tracks(rows: Rows, num_steps: int, source: Av2Source, ground: Ground) -> tuple[Tracks, np.ndarray, int]:
+    """Tracks of all steps in the order of the file, the categories, and the index of the ego."""
+    names, first_row, owner = np.unique(rows["track_id"].astype(str), return_index=True, return_inverse=True)
     order = np.argsort(first_row)  # file order
     names, first_row, owner = names[order], first_row[order], np.argsort(order)[owner]
-    step = columns["timestep"].astype(np.int64)
+    step = rows["timestep"]
     for name in ("object_type", "object_category"):
-        wrong = np.flatnonzero(columns[name] != columns[name][first_row][owner])
-        if len(wrong):
-            raise DataError(f"{file.name}: row {wrong[0]}: track {names[owner[wrong[0]]]} has a second {name}")
+        rows.check(rows[name] != rows[name][first_row][owner], f"track {{}} has a second {name}", names[owner])
     cells, counts = np.unique(owner * num_steps + step, return_counts=True)
     if (counts > 1).any():
-        track, when = divmod(int(cells[counts > 1][0]), num_steps)
-        raise DataError(f"{file.name}: track {names[track]} has two rows for timestep {when}")
-    parts = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
-    motion = np.column_stack([columns[name].astype(np.float64) for name in parts])  # [rows, 5]
-    wrong = np.flatnonzero(~(np.abs(motion) < 1e7).all(1))  # NaN is not, either
-    if len(wrong):
-        raise DataError(
-            f"{file.name}: row {wrong[0]}: track {names[owner[wrong[0]]]} has a NaN, infinite or impossible value at "
-            f"timestep {step[wrong[0]]}"
-        )
-    kinds = columns["object_type"][first_row]
-    unknown = [kind for kind in kinds if kind not in KINDS and kind not in OTHER_KINDS]
-    if unknown:
-        raise DataError(f"{file.name}: unknown object_type {unknown[0]!r}")
+        track, timestep = divmod(int(cells[counts > 1][0]), num_steps)
+        raise DataError(f"{rows.table}: track {names[track]} has two rows for timestep {timestep}")
+    motion_columns = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
+    motion = np.column_stack([rows[name] for name in motion_columns])  # [rows, 5]
+    is_impossible = ~(np.abs(motion).max(1) < 1e7)  # NaN, too
+    cause = "track {} has a NaN, infinite or impossible value at timestep {}"
+    rows.check(is_impossible, cause, names[owner], step)
+    labels = rows["object_type"][first_row]
+    unknown_labels = [label for label in labels if label not in OBJECT_TYPES and label not in UNUSED_OBJECT_TYPES]
+    if unknown_labels:
+        raise DataError(f"{rows.table}: unknown object_type {unknown_labels[0]!r}")
     if "AV" not in names:
-        raise DataError(f"{file.name} has no ego: no track AV")
+        raise DataError(f"{rows.table} has no ego: no track AV")
 
     # states [O, S]; zeros where a track is not seen
     shape = (len(names), num_steps)
     states, valid = np.zeros((*shape, 5)), np.zeros(shape, bool)
     states[owner, step], valid[owner, step] = motion, True
-    size = np.array(
-        [source.sizes[EGO if name == "AV" else kind if kind in KINDS else OTHER] for name, kind in zip(names, kinds)]
-    )  # [O, 3]
+    size_names = np.where(names == "AV", EGO, [label if label in OBJECT_TYPES else UNNAMED for label in labels])
+    size = np.array([source.sizes[name] for name in size_names])  # [O, 3]
     z = np.zeros(shape)
     z[valid] = ground.heights.at(states[valid][:, :2])
     z += size[:, 2:] / 2  # centers of boxes that stand on the ground
     position = np.concatenate([states[..., :2], z[..., None]], -1) * valid[..., None]
-    kept = np.array([source.keep_other or kind in KINDS or name == "AV" for name, kind in zip(names, kinds)])
+    is_used = source.keep_other | (size_names != UNNAMED)
     tracks = Tracks(
-        object_id=_object_ids(file, names)[kept],
-        object_type=np.array([KINDS.get(kind, ObjectType.OTHER) for kind in kinds], np.int8)[kept],
-        position=position.astype(np.float32)[kept],
-        heading=states[kept][..., 2].astype(np.float32),
-        velocity=states[kept][..., 3:].astype(np.float32),
-        size=np.where(valid[..., None], size[:, None], 0.0).astype(np.float32)[kept],
-        valid=valid[kept],
+        object_id=_object_ids(rows.table, names),
+        object_type=np.array([OBJECT_TYPES.get(label, ObjectType.OTHER) for label in labels], np.int8),
+        position=position.astype(np.float32),
+        heading=states[..., 2].astype(np.float32),
+        velocity=states[..., 3:].astype(np.float32),
+        size=np.where(valid[..., None], size[:, None], 0.0).astype(np.float32),
+        valid=valid,
     )
-    category = columns["object_category"][first_row][kept]
-    return tracks, category, int(np.flatnonzero(names[kept] == "AV")[0])
+    category = rows["object_category"][first_row][is_used]
+    return tracks.select(is_used), category, int(np.flatnonzero(names[is_used] == "AV")[0])
 
 
-def _object_ids(file: Path, names: np.ndarray) -> np.ndarray:
-    """Track ids as numbers; that of the ego is 0, or one above all others where 0 is taken."""
-    wrong = [name for name in names if name != "AV" and not (name.isdecimal() and len(name) < 19)]
-    if wrong:
-        raise DataError(f"{file.name}: track id {str(wrong[0])!r} is no number")
+def _object_ids(table: str, names: np.ndarray) -> np.ndarray:
+    """Track ids as numbers; the ego's is 0, or above the highest id where 0 is taken."""
+    invalid = [name for name in names if name != "AV" and not (name.isdecimal() and len(name) < 19)]
+    if invalid:
+        raise DataError(f"{table}: track id {str(invalid[0])!r} is no number")
     ids = np.array([-1 if name == "AV" else int(name) for name in names], np.int64)
     ids[ids == -1] = ids.max() + 1 if (ids == 0).any() else 0
     if len(np.unique(ids)) < len(ids):
-        raise DataError(f"{file.name}: two track ids are the same number")
+        raise DataError(f"{table}: two track ids are the same number")
     return ids
 
 
-def _read_id(file: Path) -> str:
+def _parse_id(file: Path) -> str:
     return file.stem.removeprefix("scenario_")
 
 
-def _parse_map(file: Path) -> Path:
-    return file.with_name(f"log_map_archive_{_read_id(file)}.json")
+def _find_map(file: Path) -> Path:
+    return file.with_name(f"log_map_archive_{_parse_id(file)}.json")
 
 
 def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
     """Sizes by kind from a JSON file."""
     example = '{"vehicle": [4.6, 2.0, 1.6]}'
     try:
-        given = read_json(path, f"sizes are written like {example}", error=ConfigError)
+        sizes = read_json(path, f"sizes are written like {example}", error=ConfigError)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file: sizes are written like {example}.") from None
-    for kind, size in given.items():
-        if kind not in SIZES_M:
-            raise ConfigError(f"{path}: no kind {kind!r}: known are {', '.join(SIZES_M)}.")
+    for object_type, size in sizes.items():
+        if object_type not in SIZES_M:
+            raise ConfigError(f"{path}: no kind {object_type!r}: known are {', '.join(SIZES_M)}.")
         is_size = isinstance(size, list) and len(size) == 3
         if not is_size or not all(type(v) in (int, float) and 0 < v < 100 for v in size):
             raise ConfigError(
-                f"{path}: the size of {kind} is {size}: write length, width, height in meters, {example}."
+                f"{path}: the size of {object_type} is {size}: write length, width, height in meters, {example}."
             )
-    return {kind: (float(size[0]), float(size[1]), float(size[2])) for kind, size in given.items()}
+    return {object_type: (float(size[0]), float(size[1]), float(size[2])) for object_type, size in sizes.items()}

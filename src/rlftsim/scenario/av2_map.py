@@ -1,7 +1,7 @@
-"""Argoverse 2 maps: vector map archives (JSON) to map features, and the ground that they cover.
+"""Argoverse 2 maps: vector map archives (JSON) to map features, and the ground that maps cover.
 
 The local map is cut out of the city's along a 30 m grid. Where the cut crosses a street, the outline of the drivable
-area is no curb: such pieces are left out of the road edges, see `find_cuts`.
+area is no curb: such stretches are left out of the road edges, see `find_cuts`.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.documents import read_json
-from rlftsim.scenario.polylines import Heights, arc_length, densify, resample_to
+from rlftsim.scenario.polylines import Heights, arc_length, densify, find_runs, resample_to
 from rlftsim.scenario.types import LaneTopology, MapFeatures, MapFeatureType
 
 CENTER_SPACING_M = 0.5
@@ -23,13 +23,13 @@ GRID_M = 30.0
 ON_GRID_M = 0.01
 """Coordinates are given in centimeters."""
 LONGEST_WALL_ON_GRID_M = 1.0
-"""Longest piece of an outline along a grid line that may be a curb."""
-LANE_KINDS = {
+"""Longest stretch of an outline along a grid line that may be a curb."""
+LANE_TYPES = {
     "VEHICLE": MapFeatureType.LANE_SURFACE_STREET,
     "BUS": MapFeatureType.LANE_SURFACE_STREET,
     "BIKE": MapFeatureType.LANE_BIKE,
 }
-MARK_KINDS = {
+LINE_TYPES = {
     "NONE": None,
     "UNKNOWN": None,
     "DASHED_WHITE": MapFeatureType.LINE_BROKEN_SINGLE_WHITE,
@@ -55,7 +55,7 @@ class Lane:
     """One lane segment of the file; both boundaries run along the lane."""
 
     lane_id: int
-    kind: str
+    lane_type: str
     left: Float[np.ndarray, "_ 3"]
     right: Float[np.ndarray, "_ 3"]
     marks: tuple[str, str]
@@ -67,7 +67,7 @@ class Lane:
     is_intersection: bool
 
     def center(self) -> Float[np.ndarray, "n 3"]:
-        """Center line. Computed, because the one in some files has all heights 0."""
+        """Center line. Computed, because the center lines of some files have all heights 0."""
         length = max(arc_length(self.left)[-1], arc_length(self.right)[-1])
         count = int(np.ceil(length / CENTER_SPACING_M))
         return (resample_to(self.left, count) + resample_to(self.right, count)) / 2
@@ -81,29 +81,27 @@ class Ground:
     area: Any
     """Union of the drivable areas, a shapely geometry."""
     walls: Any
-    """Its outline without the cuts."""
+    """Outline without the cuts."""
     cuts: Any
-    """Pieces of its outline where the map was cut out of the city's."""
+    """Stretches of the outline where the map was cut out of the city's."""
 
-    def covers(self, places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """True for places inside the drivable area, its border included."""
+    def covers(self, positions: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """True for positions inside the drivable area, border included."""
         shapely = _shapely()
-        return shapely.intersects_xy(self.area, places[:, 0], places[:, 1])
+        return shapely.intersects_xy(self.area, positions[:, 0], positions[:, 1])
 
     def leaves_through_cut(self, path: Float[np.ndarray, "n 2"]) -> bool:
-        """True if a path is outside the drivable area at least once, and got there through a cut.
+        """True if a path is outside the drivable area at least once, and left through a cut.
 
         The border that is nearer to the step over it decides; for a path that is never inside, the border nearer to its
         first point.
 
         Args:
-            path: positions in order of time, world frame.
+            path: Positions [n, 2] in order of time, world frame, m.
         """
         shapely = _shapely()
         inside = self.covers(path)
-        # starts and ends of the runs of positions outside
-        bounds = np.flatnonzero(np.diff(~inside, prepend=False, append=False))
-        for start, stop in zip(bounds[::2], bounds[1::2]):
+        for start, stop in find_runs(~inside):
             steps = [path[k - 1 : k + 1] for k in (start, stop) if 0 < k < len(path)] or [path[[0, 0]]]
             to_cuts, to_walls = (
                 # there may be no such border: infinitely far
@@ -118,11 +116,11 @@ class Ground:
 def read_map(path: Path) -> tuple[MapFeatures, Ground]:
     """Map features of a vector map archive, and the ground.
 
-    Lanes keep their ids, all other features are numbered after the highest lane id. Heights of road edges are those of
-    the nearest points of the outline.
+    Lanes keep the ids of the file, further features are numbered after the highest lane id. Heights of road edges come
+    from the nearest points of the outline.
 
     Raises:
-        DataError: the file is damaged, or not of the published schema.
+        DataError: The file is damaged, or not of the published schema.
         ConfigError: shapely is not installed.
     """
     try:
@@ -140,15 +138,15 @@ def read_map(path: Path) -> tuple[MapFeatures, Ground]:
         raise DataError(f"{path.name}: two lane segments have one id")
     lines, boundaries = _road_lines(path.name, lanes, centers)
 
-    features = [(lane.lane_id, LANE_KINDS[lane.kind], centers[lane.lane_id]) for lane in lanes]
-    features += [(line_id, kind, points) for line_id, (kind, points) in lines.items()]
+    features = [(lane.lane_id, LANE_TYPES[lane.lane_type], centers[lane.lane_id]) for lane in lanes]
+    features += [(line_id, line_type, points) for line_id, (line_type, points) in lines.items()]
     next_id = max([*centers, *lines], default=0) + 1
     for key, crossing in groups["pedestrian_crossings"].items():
-        where = f"{path.name}: pedestrian crossing {key}"
-        features.append((next_id, MapFeatureType.CROSSWALK, _crosswalk(where, crossing)))
+        location = f"{path.name}: pedestrian crossing {key}"
+        features.append((next_id, MapFeatureType.CROSSWALK, _crosswalk(location, crossing)))
         next_id += 1
     areas = [
-        _read_points(f"{path.name}: drivable area {key}", value, "area_boundary", at_least=3)
+        _read_points(f"{path.name}: drivable area {key}", value, "area_boundary", min_points=3)
         for key, value in groups["drivable_areas"].items()
     ]
     edges, ground = _road_edges(areas, lanes)
@@ -160,24 +158,23 @@ def read_map(path: Path) -> tuple[MapFeatures, Ground]:
 def find_cuts(ring: Float[np.ndarray, "corners 2"]) -> Bool[np.ndarray, "lines"]:
     """Segments of an outline along which the map was cut out of the city's, True.
 
-    They lie on a line of the 30 m grid, within a centimeter, and make a piece longer than a meter.
+    Cuts lie on a line of the 30 m grid, within a centimeter, and are longer than a meter.
 
     Args:
-        ring: closed, the last point is the first.
+        ring: Corners of the closed outline, world frame, m; the last is the first again.
     """
     lines = np.rint(ring / GRID_M)  # [n+1, 2] number of the nearest grid line along x and y
-    near = np.abs(ring - lines * GRID_M) <= ON_GRID_M
-    along = near[:-1] & near[1:] & (lines[:-1] == lines[1:])  # [n, 2]
+    is_on_grid = np.abs(ring - lines * GRID_M) <= ON_GRID_M
+    is_on_line = is_on_grid[:-1] & is_on_grid[1:] & (lines[:-1] == lines[1:])  # [n, 2]
     length = np.linalg.norm(np.diff(ring, axis=0), axis=1)
     is_cut = np.zeros(len(length), bool)
     for axis in range(2):
-        if along[:, axis].all():
+        if is_on_line[:, axis].all():
             continue
         # runs of segments on one line, begun where there is none, so that no run goes on over the end of the ring
-        first = int(np.argmin(along[:, axis]))
+        first = int(np.argmin(is_on_line[:, axis]))
         order = np.roll(np.arange(len(length)), -first)
-        bounds = np.flatnonzero(np.diff(along[order, axis], prepend=False, append=False))
-        for start, stop in zip(bounds[::2], bounds[1::2]):
+        for start, stop in find_runs(is_on_line[order, axis]):
             run = order[start:stop]
             is_cut[run] |= length[run].sum() > LONGEST_WALL_ON_GRID_M
     return is_cut
@@ -186,11 +183,11 @@ def find_cuts(ring: Float[np.ndarray, "corners 2"]) -> Bool[np.ndarray, "lines"]
 def _road_edges(areas: list[np.ndarray], lanes: list[Lane]) -> tuple[list[Float[np.ndarray, "n 3"]], Ground]:
     """Outline of the drivable areas with the road on its left, without the cuts, and the ground."""
     shapely = _shapely()
-    # Areas are tiles that abut, so their own outlines would cross the road: they are merged, on the grid of their
-    # coordinates, so that no slit is left between two of them.
+    # Areas are tiles that abut, so single outlines would cross the road: tiles are merged, on the grid of the
+    # coordinates, so that no slit is left between two tiles.
     tiles = shapely.make_valid(np.array([shapely.Polygon(area[:, :2]) for area in areas], dtype=object))
     area = shapely.union_all(tiles, grid_size=ON_GRID_M)
-    pieces: dict[bool, list[np.ndarray]] = {False: [], True: []}  # by: is a cut
+    stretches: dict[bool, list[np.ndarray]] = {False: [], True: []}  # by: is a cut
     for polygon in shapely.get_parts(area):
         if shapely.get_type_id(polygon) != 3:  # a line or point that is left of a damaged tile
             continue
@@ -204,13 +201,13 @@ def _road_edges(areas: list[np.ndarray], lanes: list[Lane]) -> tuple[list[Float[
             is_cut = np.roll(is_cut, -first)
             starts = np.flatnonzero(np.diff(is_cut, prepend=not is_cut[0]))
             for start, stop in zip(starts, [*starts[1:], len(is_cut)]):
-                pieces[bool(is_cut[start])].append(corners[start : stop + 1])
+                stretches[bool(is_cut[start])].append(corners[start : stop + 1])
     heights = Heights(np.concatenate([np.zeros((0, 3)), *areas]))
     edges = []
-    for wall in pieces[False]:
+    for wall in stretches[False]:
         points = densify(wall, EDGE_SPACING_M)
         edges.append(np.column_stack([points, heights.at(points)]))
-    walls, cuts = (shapely.MultiLineString(pieces[is_cut]) for is_cut in (False, True))
+    walls, cuts = (shapely.MultiLineString(stretches[is_cut]) for is_cut in (False, True))
     borders = [side for lane in lanes for side in (lane.left, lane.right)]
     return edges, Ground(Heights(np.concatenate([np.zeros((0, 3)), *borders])), area, walls, cuts)
 
@@ -224,16 +221,16 @@ def _road_lines(
     rows = []
     for lane in lanes:
         for side, (points, mark) in enumerate(zip((lane.left, lane.right), lane.marks)):
-            if mark not in MARK_KINDS:
+            if mark not in LINE_TYPES:
                 raise DataError(f"{name}: lane segment {lane.lane_id} has the unknown lane mark {mark!r}")
-            kind = MARK_KINDS[mark]
-            if kind is None:
+            line_type = LINE_TYPES[mark]
+            if line_type is None:
                 continue
             # neighbors in opposite directions list the same points backwards
             geometry = min(points.tobytes(), points[::-1].tobytes())
             line_id = ids.setdefault(geometry, max(centers) + 1 + len(ids))
-            lines.setdefault(line_id, (kind, points))
-            road_line = kind - MapFeatureType.LINE_UNKNOWN
+            lines.setdefault(line_id, (line_type, points))
+            road_line = line_type - MapFeatureType.LINE_UNKNOWN
             rows.append((lane.lane_id, side, line_id, 0, len(centers[lane.lane_id]) - 1, road_line))
     return lines, rows
 
@@ -244,52 +241,48 @@ def _topology(
     """Links between the lanes of the file; lanes are the first features."""
     neighbors = []
     for lane in lanes:
-        for side, other in enumerate(lane.neighbors):
-            if other is not None and other in centers:
-                own, theirs = centers[lane.lane_id], centers[other]
-                same_way = np.linalg.norm(own[[0, -1], :2] - theirs[[0, -1], :2], axis=1).sum()
-                opposite = np.linalg.norm(own[[0, -1], :2] - theirs[[-1, 0], :2], axis=1).sum()
-                if same_way <= opposite:
-                    neighbors.append((lane.lane_id, side, other, 0, len(own) - 1, 0, len(theirs) - 1))
+        for side, neighbor_id in enumerate(lane.neighbors):
+            if neighbor_id is not None and neighbor_id in centers:
+                center, neighbor_center = centers[lane.lane_id], centers[neighbor_id]
+                same_direction = np.linalg.norm(center[[0, -1], :2] - neighbor_center[[0, -1], :2], axis=1).sum()
+                opposite = np.linalg.norm(center[[0, -1], :2] - neighbor_center[[-1, 0], :2], axis=1).sum()
+                if same_direction <= opposite:
+                    neighbors.append((lane.lane_id, side, neighbor_id, 0, len(center) - 1, 0, len(neighbor_center) - 1))
     interpolating = np.zeros(num_features, bool)
     interpolating[: len(lanes)] = [lane.is_intersection for lane in lanes]
 
-    before = [(lane.lane_id, other) for lane in lanes for other in lane.predecessors if other in centers]
-    after = [(lane.lane_id, other) for lane in lanes for other in lane.successors if other in centers]
-    return LaneTopology(
-        entry_lanes=np.array(before, np.int64).reshape(-1, 2),
-        exit_lanes=np.array(after, np.int64).reshape(-1, 2),
-        neighbors=np.array(neighbors, np.int64).reshape(-1, 7),
-        boundaries=np.array(boundaries, np.int64).reshape(-1, 6),
-        interpolating=interpolating,
+    entries = [(lane.lane_id, link) for lane in lanes for link in lane.predecessors if link in centers]
+    exits = [(lane.lane_id, link) for lane in lanes for link in lane.successors if link in centers]
+    return LaneTopology.of(
+        entry_lanes=entries, exit_lanes=exits, neighbors=neighbors, boundaries=boundaries, interpolating=interpolating
     )
 
 
-def _read_lane(where: str, value: Any) -> Lane:
+def _read_lane(location: str, value: Any) -> Lane:
     if not isinstance(value, dict):
-        raise DataError(f"{where} is no object")
-    sided = [f"{side}_{part}" for part in ("lane_mark_type", "neighbor_id") for side in ("left", "right")]
+        raise DataError(f"{location} is no object")
+    sided = [f"{side}_{field}" for field in ("lane_mark_type", "neighbor_id") for side in ("left", "right")]
     for name in ("id", "lane_type", "is_intersection", "predecessors", "successors", *sided):
         if name not in value:
-            raise DataError(f"{where} has no {name}")
-    kind = value["lane_type"]
-    if kind not in list(LANE_KINDS):  # a list: the value may be of any type
-        raise DataError(f"{where} has the unknown lane type {kind!r}")
+            raise DataError(f"{location} has no {name}")
+    lane_type = value["lane_type"]
+    if lane_type not in list(LANE_TYPES):  # a list: the value may be of any type
+        raise DataError(f"{location} has the unknown lane type {lane_type!r}")
     marks = (value["left_lane_mark_type"], value["right_lane_mark_type"])
     if not all(isinstance(mark, str) for mark in marks):
-        raise DataError(f"{where} has the lane marks {marks}, they must be words")
+        raise DataError(f"{location} has the lane marks {marks}, they must be words")
     neighbors = (value["left_neighbor_id"], value["right_neighbor_id"])
     links = [value["predecessors"], value["successors"]]
     if not all(isinstance(link, list) for link in links):
-        raise DataError(f"{where}: predecessors and successors must be lists")
+        raise DataError(f"{location}: predecessors and successors must be lists")
     ids = [value["id"], *(n for n in neighbors if n is not None), *links[0], *links[1]]
-    if not all(isinstance(one, int) and not isinstance(one, bool) and 0 <= one < 2**62 for one in ids):
-        raise DataError(f"{where}: ids of lanes must be whole numbers from 0 on")
+    if not all(isinstance(lane_id, int) and not isinstance(lane_id, bool) and 0 <= lane_id < 2**62 for lane_id in ids):
+        raise DataError(f"{location}: ids of lanes must be whole numbers from 0 on")
     return Lane(
         lane_id=value["id"],
-        kind=kind,
-        left=_read_points(where, value, "left_lane_boundary", at_least=2),
-        right=_read_points(where, value, "right_lane_boundary", at_least=2),
+        lane_type=lane_type,
+        left=_read_points(location, value, "left_lane_boundary", min_points=2),
+        right=_read_points(location, value, "right_lane_boundary", min_points=2),
         marks=marks,
         neighbors=neighbors,
         predecessors=tuple(links[0]),
@@ -298,24 +291,24 @@ def _read_lane(where: str, value: Any) -> Lane:
     )
 
 
-def _read_points(where: str, value: Any, name: str, *, at_least: int) -> Float[np.ndarray, "n 3"]:
+def _read_points(location: str, value: Any, name: str, *, min_points: int) -> Float[np.ndarray, "n 3"]:
     points: Any = value.get(name) if isinstance(value, dict) else None
     try:
-        found = np.array([(point["x"], point["y"], point["z"]) for point in points], np.float64).reshape(-1, 3)
+        coordinates = np.array([(point["x"], point["y"], point["z"]) for point in points], np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise DataError(f"{where}: {name} must be a list of points with x, y and z") from None
-    if len(found) < at_least:
-        raise DataError(f"{where}: {name} has {len(found)} points, it needs {at_least}")
-    if not (np.abs(found) < 1e7).all():  # NaN is not, either
-        raise DataError(f"{where}: {name} has a NaN, infinite or impossible coordinate")
-    return found
+        raise DataError(f"{location}: {name} must be a list of points with x, y and z") from None
+    if len(coordinates) < min_points:
+        raise DataError(f"{location}: {name} has {len(coordinates)} points, it needs {min_points}")
+    if not (np.abs(coordinates) < 1e7).all():  # NaN is not, either
+        raise DataError(f"{location}: {name} has a NaN, infinite or impossible coordinate")
+    return coordinates
 
 
-def _crosswalk(where: str, value: Any) -> Float[np.ndarray, "4 3"]:
-    """Polygon of the two edges of a crossing, turned so that its border does not cross itself."""
-    first = _read_points(where, value, "edge1", at_least=2)[[0, -1]]
-    second = _read_points(where, value, "edge2", at_least=2)[[0, -1]]
-    # Edges that run the same way would make a bow tie: the way between them is shorter from end to end, then.
+def _crosswalk(location: str, value: Any) -> Float[np.ndarray, "4 3"]:
+    """Polygon of the two edges of a crossing, turned so that the border does not cross."""
+    first = _read_points(location, value, "edge1", min_points=2)[[0, -1]]
+    second = _read_points(location, value, "edge2", min_points=2)[[0, -1]]
+    # Edges in the same direction would make a bow tie: then the distance is shorter from end to end.
     direct = np.linalg.norm(first[1] - second[0]) + np.linalg.norm(first[0] - second[1])
     turned = np.linalg.norm(first[1] - second[1]) + np.linalg.norm(first[0] - second[0])
     return np.concatenate([first, second[::-1] if turned < direct else second])

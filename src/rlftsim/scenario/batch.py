@@ -17,10 +17,10 @@ Frame = Literal["map", "world"]
 
 @dataclass(frozen=True, eq=False)
 class ScenarioBatch:
-    """B scenarios, their simulated agents (valid at the current step, track order) padded to A.
+    """B scenarios, whose simulated agents (valid at the current step, track order) are padded to A.
 
-    Frame: map, i.e. world minus the scenario's own origin (whole meters, exact in float32). Padding has `agent_mask`
-    False and zeros elsewhere. S is the largest number of logged steps; a shorter log is invalid beyond its end.
+    Frame: map, i.e. world minus the scenario's origin (whole meters, exact in float32). Padding has `agent_mask`
+    False and zeros elsewhere. S is the largest number of logged steps; a shorter log is invalid beyond the end.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -54,7 +54,7 @@ class ScenarioBatch:
         """Positions of the map frame in the world frame, float32.
 
         Args:
-            position: of the N rollouts of each scenario over T steps, map frame.
+            position: Positions of A agents in N rollouts of each scenario over T steps, map frame, m.
         """
         # added in float64, so that only the result is rounded
         return (position.double() + self.origin[:, None, None, None].to(position.device)).float()
@@ -65,12 +65,12 @@ class ScenarioBatch:
         return replace(self, **moved)
 
     def split(self, size: int) -> tuple["ScenarioBatch", ...]:
-        """Batches of at most `size` of the scenarios each, in their order, padded as this one is."""
+        """Batches of at most `size` scenarios each, in order, with the same padding."""
         # every tensor has the scenarios along its first axis
         tensors = {f.name: v.split(size) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return tuple(
-            replace(self, scenarios=self.scenarios[i * size : (i + 1) * size], **dict(zip(tensors, parts)))
-            for i, parts in enumerate(zip(*tensors.values()))
+            replace(self, scenarios=self.scenarios[i * size : (i + 1) * size], **dict(zip(tensors, chunks)))
+            for i, chunks in enumerate(zip(*tensors.values()))
         )
 
     def __repr__(self) -> str:
@@ -81,16 +81,16 @@ class ScenarioBatch:
 
 
 def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, frame: Frame = "map") -> ScenarioBatch:
-    """Batch of scenarios.
+    """Batch of scenarios, with the agents that are valid at the current step.
 
     Args:
-        scenarios: at least one.
-        max_agents: pad to this many agents; None = as many as the fullest scenario has.
+        scenarios: Scenarios of the batch, at least 1; logs of different lengths are padded.
+        max_agents: Number of agents A that every scenario is padded to; None = as many as the fullest scenario has.
         frame: "map" = centered on each scenario. "world" = as logged, kilometers from the origin, where float32 rounds
             to half a millimeter: for comparison with code that works there.
 
     Raises:
-        DataError: no scenario, or a scenario with more agents than `max_agents`.
+        DataError: No scenario, or a scenario with more agents than `max_agents`.
     """
     if not scenarios:
         raise DataError("cannot batch 0 scenarios: pass at least one.")
@@ -110,8 +110,8 @@ def compute_origin(scenario: Scenario, frame: Frame) -> Float[np.ndarray, "2"]:
     """World coordinates of a frame's (0, 0), float64, meters.
 
     Args:
-        scenario: its own origin is that of its map frame.
-        frame: "map" or "world".
+        scenario: Scenario whose `origin` is the center of the map frame.
+        frame: Frame of the positions, "map" or "world"; the origin of "world" is (0, 0).
     """
     return scenario.origin if frame == "map" else np.zeros(2)
 
@@ -119,26 +119,26 @@ def compute_origin(scenario: Scenario, frame: Frame) -> Float[np.ndarray, "2"]:
 def _agent_rows(
     scenario: Scenario, num_agents: int, num_steps: int, origin: Float[np.ndarray, "2"]
 ) -> dict[str, np.ndarray]:
-    """One scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
-    tracks, chosen = scenario.tracks, scenario.simulated_indices
-    valid = tracks.valid[chosen]
-    centered = tracks.position[chosen]  # [A, S, 3] world
+    """A scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
+    tracks, indices = scenario.tracks, scenario.simulated_indices
+    valid = tracks.valid[indices]
+    centered = tracks.position[indices]  # [A, S, 3] world
     centered[..., :2] -= origin
-    heading, velocity = tracks.heading[chosen], tracks.velocity[chosen]
+    heading, velocity = tracks.heading[indices], tracks.velocity[indices]
     # zeros in place of the log's values, which mean nothing where a state is not valid and may be NaN
     for values in (centered, heading, velocity):
         values[~valid] = 0
     return {
         "origin": origin,
-        "object_id": _pad(tracks.object_id[chosen], num_agents),
-        "object_type": _pad(tracks.object_type[chosen].astype(np.int64), num_agents),
-        "agent_mask": _pad(np.ones(len(chosen), bool), num_agents),
-        "evaluated_mask": _pad(np.isin(chosen, scenario.evaluated_indices), num_agents),
+        "object_id": _pad(tracks.object_id[indices], num_agents),
+        "object_type": _pad(tracks.object_type[indices].astype(np.int64), num_agents),
+        "agent_mask": _pad(np.ones(len(indices), bool), num_agents),
+        "evaluated_mask": _pad(np.isin(indices, scenario.evaluated_indices), num_agents),
         "position": _pad(centered[..., :2], num_agents, num_steps),
         "z": _pad(centered[..., 2], num_agents, num_steps),
         "heading": _pad(heading, num_agents, num_steps),
         "velocity": _pad(velocity, num_agents, num_steps),
-        "size": _pad(tracks.size[chosen, CURRENT_STEP], num_agents),
+        "size": _pad(tracks.size[indices, CURRENT_STEP], num_agents),
         "valid": _pad(valid, num_agents, num_steps),
     }
 

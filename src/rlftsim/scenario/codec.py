@@ -4,11 +4,11 @@ Neighbors along the last axis (steps of a track, points of a polyline) are alike
 differences or differences of differences along the last axis, then bytes sorted by significance, then zstd:
 
     float32 on a binary grid (all values are multiples of 2**-k)   the multiples
-    other floats                                                   their bits
-    integers                                                       themselves, 32 bits wide if they fit
-    one-byte values                                                themselves
+    floats off a grid                                              the bits
+    integers                                                       the integers, 32 bits wide if they fit
+    one-byte values                                                the bytes
 
-Every bit comes back: NaN payloads, infinities and -0.0 too. An encoded array holds its own dtype and shape.
+Every bit comes back: NaN payloads, infinities and -0.0 too. An encoded array holds dtype and shape, too.
 """
 
 import struct
@@ -29,7 +29,7 @@ def encode_array(array: np.ndarray | np.generic) -> bytes:
     """Compressed form of `array` [..., n], whose neighbors along the last axis are alike.
 
     Raises:
-        TypeError: the dtype is none of bool, int8, uint8, int32, int64, float32, float64.
+        TypeError: The dtype is not among bool, int8, uint8, int32, int64, float32, float64.
     """
     if array.dtype not in _DTYPES:
         raise TypeError(f"cannot encode dtype {array.dtype}: it must be one of {', '.join(map(str, _DTYPES))}")
@@ -49,7 +49,7 @@ def decode_array(data: bytes | pa.Buffer) -> np.ndarray:
     """Array that `encode_array` turned into `data`; a new one that may be written to.
 
     Raises:
-        ValueError: the bytes are no encoded array.
+        ValueError: The bytes are no encoded array.
     """
     view = memoryview(data)
     try:
@@ -96,7 +96,7 @@ def _from_words(words: np.ndarray, dtype: np.dtype, method: int, exponent: int) 
 
 
 def _to_grid(array: np.ndarray) -> tuple[np.ndarray, int] | None:
-    """Multiples of 2**-exponent that are exactly `array`, with the smallest such exponent; None if there is none."""
+    """Multiples of 2**-exponent that are exactly `array`, with the smallest such exponent; None without a grid."""
     if not np.isfinite(array).all():
         return None
     values = array.astype(np.float64)
@@ -108,14 +108,14 @@ def _to_grid(array: np.ndarray) -> tuple[np.ndarray, int] | None:
         if not np.array_equal(scaled, np.rint(scaled)):
             continue
         words = scaled.astype(np.int32)
-        same = np.array_equal(_from_words(words, array.dtype, _GRID, exponent).view(np.int32), array.view(np.int32))
-        return (words, exponent) if same else None  # -0.0 is on the grid, but its sign would be lost
+        is_exact = np.array_equal(_from_words(words, array.dtype, _GRID, exponent).view(np.int32), array.view(np.int32))
+        return (words, exponent) if is_exact else None  # -0.0 is on the grid, but its sign would be lost
     return None
 
 
 def _smallest_differences(words: np.ndarray) -> tuple[np.ndarray, int]:
     """Zigzag-coded differences along the last axis, of the order that needs the fewest bits, and that order."""
-    best, best_order, best_bits = words, 0, np.inf
+    smallest, smallest_order, fewest_bits = words, 0, np.inf
     for order in range(_MAX_ORDER + 1):
         if order:
             # each value minus the one before it, modulo the width; the first stays
@@ -126,6 +126,6 @@ def _smallest_differences(words: np.ndarray) -> tuple[np.ndarray, int]:
         sign = words >> (8 * words.itemsize - 1)
         candidate = ((words << 1) ^ sign).view(f"u{words.itemsize}")
         bits = np.log2(candidate.astype(np.float64) + 1.0).sum()
-        if bits < best_bits:
-            best, best_order, best_bits = candidate, order, bits
-    return best, best_order
+        if bits < fewest_bits:
+            smallest, smallest_order, fewest_bits = candidate, order, bits
+    return smallest, smallest_order

@@ -1,7 +1,7 @@
 """Positions, velocities, headings and heights of logged tracks held against each other, and against the map.
 
-They are redundant, so a log in another frame, unit or time base contradicts itself. A single track may, because its
-detections are noisy; a scenario does where more than half of its moving tracks do.
+The four are redundant, so a log in another frame, unit or time base contradicts itself. A single track may, because
+detections are noisy; a scenario does where more than half of the moving tracks do.
 """
 
 import math
@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from rlftsim.scenario.types import STEP_S, MapFeatures, ObjectType, Tracks
 
-LEAST_STEPS = 10
+MIN_STEPS = 10
 """Steps that a track must move to be judged; of these more than half must agree."""
 MOVING_MPS = 1.0
 SPEED_TOLERANCE_MPS, SPEED_TOLERANCE = 1.0, 0.3
@@ -22,7 +22,7 @@ SPEED_TOLERANCE_MPS, SPEED_TOLERANCE = 1.0, 0.3
 TYPES_WITH_FRONT = (ObjectType.VEHICLE, ObjectType.CYCLIST)
 DRIVING_MPS = 3.0
 """Vehicles and cyclists that are faster face the way they move; slower ones may back up, and pedestrians step aside."""
-LEAST_COSINE = math.cos(math.pi / 4)
+MIN_COSINE = math.cos(math.pi / 4)
 MAX_CLIMB_M = 2.0
 """In 0.1 s; no track of 573 real and synthetic scenarios climbs or falls by more than 0.8."""
 MAX_SAMPLES = 100
@@ -35,14 +35,14 @@ scenarios none is off by more than 4.1."""
 def describe_contradictions(
     tracks: Tracks, map_features: MapFeatures | None = None, guessed: Collection[str] = ()
 ) -> str:
-    """Contradictions of most moving tracks, in words with the first such track; empty where there is none.
+    """Contradictions of most moving tracks, in words with the first such track; empty where no track does.
 
     Args:
-        tracks: All tracks of a scenario; states that are not valid are left out.
+        tracks: All tracks of a scenario, world frame; states that are not valid are left out.
         map_features: Map of the same frame, whose heights are held against those of tracks; None = there is none.
         guessed: What the source of the scenario makes up, as in `Scenario.guessed`; heights "z" are not judged then.
     """
-    seen = tracks.valid[:, 1:] & tracks.valid[:, :-1]  # [O, S-1]
+    is_observed = tracks.valid[:, 1:] & tracks.valid[:, :-1]  # [O, S-1]
     with np.errstate(invalid="ignore", over="ignore"):  # states that are not valid may hold infinities
         x, y = np.ascontiguousarray(np.moveaxis(tracks.position[..., :2], -1, 0))  # each [O, S]
         vx, vy = np.ascontiguousarray(np.moveaxis(tracks.velocity, -1, 0))
@@ -52,20 +52,22 @@ def describe_contradictions(
         faster = np.maximum(moved_mps, said_mps)
         is_off = off_mps > np.maximum(SPEED_TOLERANCE_MPS, SPEED_TOLERANCE * faster)
         heading = tracks.heading[:, 1:]
-        is_askew = dx * np.cos(heading) + dy * np.sin(heading) < LEAST_COSINE * moved_mps
+        is_askew = dx * np.cos(heading) + dy * np.sin(heading) < MIN_COSINE * moved_mps
+        climb_mps = np.abs(np.diff(tracks.position[..., 2])) / np.float32(STEP_S)
     has_front = np.isin(tracks.object_type, TYPES_WITH_FRONT)
-    is_moving = seen & (2 * (seen & (faster > MOVING_MPS)).sum(1) > seen.sum(1))[:, None]
-    is_driving = seen & (moved_mps > DRIVING_MPS) & has_front[:, None]
+    is_moving = is_observed & (2 * (is_observed & (faster > MOVING_MPS)).sum(1) > is_observed.sum(1))[:, None]
+    is_driving = is_observed & (moved_mps > DRIVING_MPS) & has_front[:, None]
     texts = []
     contrary, num_judged = find_contrary(is_moving, is_off)
     if 2 * len(contrary) > num_judged:
         track = contrary[0]
         steps = is_moving[track] & is_off[track]
-        by_position, by_velocity, apart = (float(np.median(v[track, steps])) for v in (moved_mps, said_mps, off_mps))
+        medians = (float(np.median(speed[track, steps])) for speed in (moved_mps, said_mps, off_mps))
+        by_position, by_velocity, difference = medians
         texts.append(
             f"velocities contradict the change of positions in {len(contrary)} of {num_judged} moving tracks: track "
             f"{tracks.object_id[track]} moves at {by_position:.1f} m/s, its velocity is {by_velocity:.1f} m/s and "
-            f"{apart:.1f} m/s off"
+            f"{difference:.1f} m/s off"
         )
     contrary, num_judged = find_contrary(is_driving, is_askew)
     if 2 * len(contrary) > num_judged:
@@ -73,22 +75,34 @@ def describe_contradictions(
             f"headings contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
             f"{DRIVING_MPS:g} m/s: track {tracks.object_id[contrary[0]]} faces more than 45 degrees away from it"
         )
-    if "z" not in guessed:
-        texts += _describe_heights(tracks, map_features, seen, is_moving)
+    if "z" in guessed:
+        return "; ".join(texts)
+    contrary, num_judged = find_contrary(is_driving, climb_mps > moved_mps)
+    if 2 * len(contrary) > num_judged:
+        track = contrary[0]
+        texts.append(
+            f"heights contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
+            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[track]} climbs or falls at "
+            f"{float(np.median(climb_mps[track, is_driving[track]])):.1f} m/s, more than 45 degrees"
+        )
+    texts += _describe_heights(tracks, map_features, is_observed, is_moving)
     return "; ".join(texts)
 
 
 def _describe_heights(
-    tracks: Tracks, map_features: MapFeatures | None, seen: Bool[np.ndarray, "O s"], is_moving: Bool[np.ndarray, "O s"]
+    tracks: Tracks,
+    map_features: MapFeatures | None,
+    is_observed: Bool[np.ndarray, "O s"],
+    is_moving: Bool[np.ndarray, "O s"],
 ) -> Iterator[str]:
     """Heights that jump, and those of most moving tracks that are not the map's."""
     with np.errstate(invalid="ignore", over="ignore"):
-        climb_m = np.abs(np.diff(tracks.position[..., 2])) * seen
+        climb_m = np.abs(np.diff(tracks.position[..., 2])) * is_observed
     jumps = np.argwhere(climb_m > MAX_CLIMB_M)
     if len(jumps):
         track, step = jumps[0]
         yield (
-            f"heights (z) jump in {len(set(jumps[:, 0]))} of {len(seen)} tracks: track {tracks.object_id[track]} "
+            f"heights (z) jump in {len(set(jumps[:, 0]))} of {len(climb_m)} tracks: track {tracks.object_id[track]} "
             f"climbs or falls by {climb_m[track, step]:.1f} m from step {step} to {step + 1}"
         )
     points = np.zeros((0, 3)) if map_features is None else _sample_points(map_features)
@@ -117,10 +131,10 @@ def _describe_heights(
 def _sample_points(map_features: MapFeatures) -> Float[np.ndarray, "n 3"]:
     """Points of the map, and further ones where two of a feature are more than 10 m apart."""
     points = map_features.points.astype(np.float64)
-    steps = np.diff(points, axis=0, append=points[-1:])
     ends = map_features.offsets[1:] - 1
-    steps[ends[ends >= 0]] = 0.0
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # points that are not finite are left out at last
+        steps = np.diff(points, axis=0, append=points[-1:])
+        steps[ends[ends >= 0]] = 0.0
         length_m = np.hypot(steps[:, 0], steps[:, 1])
         count = np.nan_to_num(np.ceil(length_m / MAP_RADIUS_M)).clip(1, MAX_SAMPLES).astype(np.int64)
         index = np.repeat(np.arange(len(points)), count)
@@ -141,9 +155,9 @@ def find_contrary(
     """Tracks that contradict themselves in most of the steps in which they are judged, and how many are judged.
 
     Args:
-        is_judged: True = the track is judged at the step; at fewer than `LEAST_STEPS` it is not judged at all.
-        is_contrary: True = the track contradicts itself there.
+        is_judged: True = the track is judged at the step; fewer than `MIN_STEPS` steps are too few for a judgment.
+        is_contrary: True = the track contradicts the log's other values at the step.
     """
     num_steps = is_judged.sum(1)
-    is_enough = num_steps >= LEAST_STEPS
+    is_enough = num_steps >= MIN_STEPS
     return np.flatnonzero(is_enough & (2 * (is_judged & is_contrary).sum(1) > num_steps)), int(is_enough.sum())

@@ -22,7 +22,7 @@ from rlftsim.jobs.documents import parse_json, read_json
 from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease, check_folder, check_name
 from rlftsim.jobs.items import ResultFormat, run_items
-from rlftsim.jobs.runner import Runner, check_finished, choose_runner, usable_cores
+from rlftsim.jobs.runner import Runner, check_finished, choose_runner, select_items, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -183,8 +183,8 @@ def convert(
         show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: Nothing to read, nothing readable in it, a destination with other contents, or one that cannot be
-            written to; under "stop" also the first bad file or record.
+        DataError: No files to read or none readable, a destination with other contents or without write access; under
+            "stop" also the first bad file or record.
         SetAside: Units that killed their process again and again; all others are converted.
         Unfinished: `runner` is a share, which is done, while others are not.
         ConfigError: An unknown data source or option, fewer than one process, a split without a name, or shares with
@@ -222,7 +222,7 @@ def convert(
 
     # 3. Make the shards that earlier runs have not finished, then index and manifest.
     runner = runner or choose_runner(jobs or usable_cores(), len(tasks), on_death=on_error)
-    selected = {task.shard for task in runner.select(tasks)}
+    selected = {task.shard for task in select_items(runner, tasks)}
     shards = _Shards(folder, data_source)
     for task in tasks:
         if task.shard not in selected:
@@ -243,13 +243,13 @@ def convert(
         earlier = _earlier_manifest(folder)
         manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note, lease)
         lease.remove()
-    return _report(folder, outcomes, manifest, earlier.duplicates if earlier else ())
+    return _report(folder, outcomes, manifest, earlier.duplicates)
 
 
 def _find_finished(folder: Path) -> dict[str, _FinishedShard]:
     """Shards that earlier runs finished, by path: from the manifest and the receipts of runs that got no further."""
     earlier = _earlier_manifest(folder)
-    shards = {entry.file: _FinishedShard(entry, earlier.provenance) for entry in earlier.shards} if earlier else {}
+    shards = {entry.file: _FinishedShard(entry, earlier.provenance) for entry in earlier.shards}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
         with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
             receipt = read_json(path, "convert again")
@@ -279,12 +279,12 @@ def _plain(settings: Mapping[str, object]) -> dict[str, object]:
     return parse_json(json.dumps(settings), "give plain values", source="settings of the source")
 
 
-def _earlier_manifest(folder: Path) -> Manifest | None:
-    """Manifest of the data set that is added to; None where there is none that can be read."""
+def _earlier_manifest(folder: Path) -> Manifest:
+    """Manifest of the data set that is added to; an empty manifest where none can be read."""
     try:
         return parse_manifest(folder)
     except DataError:
-        return None
+        return Manifest(shards=(), num_scenarios=0, counts={}, index_sha256="", license_note="")
 
 
 def _convert_unit(
@@ -336,24 +336,19 @@ def _convert_unit(
         bytes_left -= num_bytes
         advance(num_bytes)
 
-    writer = ShardWriter(task.folder / task.shard)
-    try:
+    with ShardWriter(task.folder / task.shard) as writer:
         scenarios = read_unit(
             source,
             task.unit,
             on_error=task.on_error,
             report=skipped.append,
             advance=count,
-            tally=lambda tally: tallies.update({tally.what: tally.count}),
+            tally=lambda tally: tallies.update({tally.event: tally.count}),
         )
         for record, scenario in scenarios:
             writer.add(scenario, task.split, record)
             if is_stopped():
                 raise _Stopped
-        writer.close()
-    except BaseException:
-        writer.discard()
-        raise
     # bytes between records, and all of them for a source that does not count
     advance(bytes_left)
 
@@ -409,16 +404,10 @@ def _finish(
         raise DataError(f"not one scenario could be converted{first}")
     earlier = _earlier_manifest(folder)
     note = license_note or source.license_note
-    if earlier is not None and note not in earlier.license_note:
-        note = f"{earlier.license_note} {note}"  # of several sources every license applies
-    elif earlier is not None:
-        note = earlier.license_note
-    manifest = write_index_and_manifest(
-        folder,
-        entries.values(),
-        license_note=note,
-        provenance={**(earlier.provenance if earlier else {}), **source.describe()},
-    )
+    # of several sources every license applies
+    note = earlier.license_note if note in earlier.license_note else f"{earlier.license_note} {note}".lstrip()
+    provenance = {**earlier.provenance, **source.describe()}
+    manifest = write_index_and_manifest(folder, entries.values(), license_note=note, provenance=provenance)
     # only now: until the manifest is there the receipts are the only memory of finished shards
     for receipt in (folder / SHARDS).rglob(_RECEIPTS):
         receipt.unlink()

@@ -1,13 +1,13 @@
 """A data set: a folder of Arrow shards, an index and a manifest.
 
-Everything is in it; what it was made from is never opened again.
+A data set is complete: the source files are never opened again.
 
     manifest.json       schema version, shards with checksums and sources, counts, license note; written last
-    index.parquet       one row per scenario: its shard and row, counts of its contents
+    index.parquet       a row per scenario: shard and row, counts of the contents
     shards/*.arrow      the scenarios
     INCOMPLETE          only while a conversion runs or after it was interrupted
 
-Files are written under temporary names and renamed, so a file under its own name is whole.
+Files are written under temporary names and renamed, so a file under a final name is complete.
 """
 
 import difflib
@@ -19,9 +19,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
+from itertools import groupby
 from pathlib import Path, PurePosixPath
 from threading import Lock
-from types import TracebackType
 from typing import Any, overload
 
 import numpy as np
@@ -33,17 +33,11 @@ import rlftsim
 from rlftsim.errors import ConfigError, DataError, check_types, whole_number
 from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, validate_folder
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import cannot_write, write_atomically, write_text
+from rlftsim.jobs.files import errors_name, write_atomically, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.index_row import AGENT_COLUMNS
-from rlftsim.scenario.shards import (
-    INDEX_FIELDS,
-    SCHEMA_VERSION,
-    ShardReader,
-    ShardWriter,
-    hash_file,
-)
+from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
 from rlftsim.scenario.splits import find_clusters, find_split
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -60,22 +54,22 @@ INDEX_SCHEMA = pa.schema([*INDEX_FIELDS, pa.field("shard", pa.string()), pa.fiel
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """One shard in the manifest."""
+    """A shard in the manifest."""
 
     file: str
     """Path inside the data set's folder."""
     sha256: str
     num_rows: int
     split: str | None = None
-    """Set where all rows are of one split because their source is."""
+    """Set where all rows are of one split because the source file is."""
     source: str | None = None
-    """Name of the file it was converted from."""
+    """Name of the source file."""
     source_bytes: int | None = None
     source_sha256: str | None = None
-    """Of what it was made from: the bytes of the files, and the settings of the data source."""
+    """Hash of the source: the bytes of the files, and the settings of the data source."""
     skipped: tuple[SkippedRecord, ...] = ()
     tallies: Mapping[str, int] = field(default_factory=dict)
-    """Numbers of what the data source counted."""
+    """Counts of the data source, by event."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,7 @@ class Manifest:
     """Scenarios by split."""
     index_sha256: str
     duplicates: tuple[SkippedRecord, ...] = ()
-    """Scenarios that are in a shard but not in the index, because an earlier one has the same id."""
+    """Scenarios that are in a shard but not in the index, because an earlier scenario has the same id."""
     license_note: str = DEFAULT_LICENSE_NOTE
     provenance: Mapping[str, object] = field(default_factory=dict)
     """Origin of the data in plain JSON values, e.g. the seed of a generator or the values a source had to guess."""
@@ -100,18 +94,18 @@ class Manifest:
 class ScenarioDataset:
     """Scenarios of a data set's folder, by position or by id.
 
-    As long as a scenario is in the cache the same object comes back, so values derived from it can be cached by
-    identity. Can be handed to other processes: each opens the files itself.
+    As long as a scenario is in the cache the same object comes back, so values computed from a scenario can be cached
+    by identity. A data set can be handed to other processes: each opens the files again.
 
     Args:
-        folder: the data set, also in a bucket (s3://bucket/folder), of which shards are fetched when they are needed;
-            "synthetic" = the one that ships with the package.
-        split: only scenarios of this split, e.g. "training"; None = all. "tune" and "exam" are drawn from validation
-            where they are not stored, see `scenario.splits`.
-        cache_size: decoded scenarios kept in memory, the least recently used go first (about 1 MB each).
+        folder: Folder of the data set, also in a bucket (s3://bucket/folder), of which shards are fetched when they are
+            needed; "synthetic" = the data set that ships with the package.
+        split: Split of the scenarios, e.g. "training"; None = all splits. "tune" and "exam" are drawn from validation
+            if not stored, see `scenario.splits`.
+        cache_size: Number of decoded scenarios in memory, about 1 MB each; the least recently used go first.
 
     Raises:
-        DataError: no data set there, an unfinished or damaged one, or it has no such split.
+        DataError: No data set in the folder, an unfinished or damaged data set, or no such split.
     """
 
     def __init__(self, folder: str | os.PathLike[str], split: str | None = None, *, cache_size: int = 256) -> None:
@@ -127,15 +121,15 @@ class ScenarioDataset:
             raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
         self.index = index
         if split is not None:
-            is_chosen = find_split(self, split)
-            if split not in self.manifest.counts and not is_chosen.any():
-                known = ", ".join(self.manifest.counts) or "none"
+            is_in_split = find_split(self, split)
+            if split not in self.manifest.counts and not is_in_split.any():
+                splits = ", ".join(self.manifest.counts) or "none"
                 raise DataError(
-                    f"{self.folder} has no split {split!r}, only {known}: name one of these as the split, in Python "
+                    f"{self.folder} has no split {split!r}, only {splits}: name one of these as the split, in Python "
                     "by load_dataset(name, split)"
                 )
-            self.index = index.filter(pa.array(is_chosen))
-        """Table with the columns of `INDEX_SCHEMA`, one row per scenario, in the order of positions."""
+            self.index = index.filter(pa.array(is_in_split))
+        """Table with the columns of `INDEX_SCHEMA`, a row per scenario, in the order of positions."""
         self.scenario_ids: list[str] = self.index["scenario_id"].to_pylist()
         self._shard_names: list[str] = self.index["shard"].to_pylist()
         self._rows: list[int] = self.index["row"].to_pylist()
@@ -147,7 +141,7 @@ class ScenarioDataset:
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
-        """Names of the data sources of its scenarios, in alphabetical order."""
+        """Names of the data sources of the scenarios, in alphabetical order."""
         return tuple(sorted(set(self.index["source"].to_pylist())))
 
     @cached_property
@@ -161,7 +155,7 @@ class ScenarioDataset:
         return find_clusters(self)
 
     def find_cluster(self, scenario_id: str) -> str:
-        """Label of the street network or recording of one scenario."""
+        """Label of a scenario's street network or recording."""
         return self.clusters[self._position[scenario_id]]
 
     @cached_property
@@ -171,12 +165,12 @@ class ScenarioDataset:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of the files with its scenarios: of another place the same, of data that was converted otherwise not.
+        """Hash of the files with the scenarios: equal for a copy, different for data that was converted otherwise.
 
-        Files of other splits have no part in it: adding one changes nothing.
+        Files of further splits do not count.
         """
-        own = set(self._shard_names)
-        checksums = "".join(entry.sha256 for entry in self.manifest.shards if entry.file in own)
+        files = set(self._shard_names)
+        checksums = "".join(entry.sha256 for entry in self.manifest.shards if entry.file in files)
         return hashlib.blake2b(checksums.encode(), digest_size=16).hexdigest()
 
     def __len__(self) -> int:
@@ -187,21 +181,21 @@ class ScenarioDataset:
     @overload
     def __getitem__(self, position: slice | Iterable[int], /) -> list[Scenario]: ...
     def __getitem__(self, position: Any, /) -> Scenario | list[Scenario]:
-        """Scenario at a position of the index, or with a scenario id; a list of them for a slice or several positions.
+        """Scenario at a position of the index, or with an id; a list of scenarios for a slice or several positions.
 
         Negative positions count from the end.
 
         Raises:
-            ConfigError: neither a whole number nor an id, a slice or several of these.
-            IndexError: there is no such position.
-            DataError: there is no such id, or the scenario's shard is missing or damaged.
+            ConfigError: Neither a whole number nor an id, a slice or several of these.
+            IndexError: The position lies beyond the data set.
+            DataError: The id is unknown, or the scenario's shard is missing or damaged.
         """
         if isinstance(position, str):
             return self.by_id(position)
         if isinstance(position, slice):
-            return [self[one] for one in range(len(self))[position]]
+            return [self[index] for index in range(len(self))[position]]
         if isinstance(position, list | tuple) or getattr(position, "ndim", 0) == 1:
-            return [self[one] for one in position]
+            return [self[index] for index in position]
         position = whole_number("position of a scenario", position)
         if not -len(self) <= position < len(self):
             raise IndexError(f"position {position} in a data set of {len(self)} scenarios")
@@ -213,7 +207,7 @@ class ScenarioDataset:
         return (self[position] for position in range(len(self)))
 
     def __contains__(self, scenario: object) -> bool:
-        """True for a scenario of the data set, or its id."""
+        """True for a scenario of the data set, or a scenario id."""
         return (scenario.scenario_id if isinstance(scenario, Scenario) else scenario) in self._position
 
     def __reduce__(self) -> tuple[Callable[..., "ScenarioDataset"], tuple[object, ...]]:
@@ -236,7 +230,7 @@ class ScenarioDataset:
         return scenario
 
     def _shard_path(self, name: str) -> Path:
-        """Local path of a shard; of a remote data set, that in the cache of this machine."""
+        """Local path of a shard; of a remote data set, the path in the cache of this machine."""
         sha256 = {entry.file: entry.sha256 for entry in self.manifest.shards}.get(name)
         if sha256 is None:
             raise DataError(f"{self.folder / INDEX} names a shard {name!r} that {MANIFEST} lacks: convert again")
@@ -248,109 +242,12 @@ class ScenarioDataset:
         """Scenario with the given id.
 
         Raises:
-            DataError: the data set (or its split) has none.
+            DataError: The data set, or the split, has no such scenario.
         """
         if scenario_id not in self._position:
-            of_split = f" (split {self.split})" if self.split else ""
-            raise DataError(f"{self.folder}{of_split} has no scenario {scenario_id!r}")
+            split = f" (split {self.split})" if self.split else ""
+            raise DataError(f"{self.folder}{split} has no scenario {scenario_id!r}")
         return self[self._position[scenario_id]]
-
-
-class DatasetWriter:
-    """Writes a new data set; use it as a context manager.
-
-    The folder appears, whole, when the block ends without an error.
-
-    Args:
-        folder: must not exist or be empty.
-        scenarios_per_shard: a new shard is begun after so many.
-        license_note: license of the data, for the manifest.
-        provenance: origin of the data in plain JSON values, for the manifest.
-
-    Raises:
-        DataError: the folder is not empty, or cannot be written to.
-    """
-
-    def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        scenarios_per_shard: int = 256,
-        license_note: str = DEFAULT_LICENSE_NOTE,
-        provenance: Mapping[str, object] | None = None,
-    ) -> None:
-        self.folder = validate_folder(folder)
-        check_folder(self.folder, "data set")
-        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
-        # beside the folder, so that renaming it never crosses file systems
-        self._temporary = self.folder.absolute().with_name(f".{self.folder.name}.{os.getpid()}.tmp")
-        self._scenarios_per_shard = scenarios_per_shard
-        self._license_note = license_note
-        self._provenance = dict(provenance or {})
-        self._entries: list[ShardEntry] = []
-        self._ids: set[str] = set()
-        self._shard: ShardWriter | None = None
-        shutil.rmtree(self._temporary, ignore_errors=True)
-        try:
-            (self._temporary / SHARDS).mkdir(parents=True)
-        except OSError as error:
-            raise cannot_write(self.folder, error) from error
-
-    def __enter__(self) -> "DatasetWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            if kind is None:
-                self.close()
-        finally:
-            self.discard()  # after `close` there is nothing left to discard
-
-    def add(self, scenario: Scenario, split: str = "unknown") -> None:
-        """Append a scenario.
-
-        Args:
-            scenario: one with an id of its own, whose valid states and map points are finite.
-            split: name of its split.
-
-        Raises:
-            DataError: there is one with this id already, or `ShardWriter.add` refuses it.
-        """
-        if scenario.scenario_id in self._ids:
-            raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
-        if self._shard is None:
-            self._shard = ShardWriter(self._temporary / SHARDS / f"{len(self._entries):05d}.arrow")
-        self._shard.add(scenario, split)
-        self._ids.add(scenario.scenario_id)
-        if self._shard.num_rows == self._scenarios_per_shard:
-            self._finish_shard()
-
-    def close(self) -> Manifest:
-        """Write index and manifest and give the folder its name."""
-        self._finish_shard()
-        manifest = write_index_and_manifest(
-            self._temporary, self._entries, license_note=self._license_note, provenance=self._provenance
-        )
-        # the folder is renamed whole, so nothing ever sees half a data set
-        if self.folder.exists():
-            self.folder.rmdir()
-        os.replace(self._temporary, self.folder)
-        return manifest
-
-    def discard(self) -> None:
-        """Throw away everything written so far."""
-        if self._shard is not None:
-            self._shard.discard()
-        shutil.rmtree(self._temporary, ignore_errors=True)
-
-    def _finish_shard(self) -> None:
-        if self._shard is not None:
-            self._shard.close()
-            self._entries.append(describe_shard(self._temporary, self._shard.path, self._shard.num_rows))
-            self._shard = None
 
 
 def write_dataset(
@@ -360,41 +257,72 @@ def write_dataset(
     split: str | Callable[[Scenario], str] = "unknown",
     license_note: str = DEFAULT_LICENSE_NOTE,
     provenance: Mapping[str, object] | None = None,
+    scenarios_per_shard: int = 256,
 ) -> Manifest:
     """Write `scenarios` as a new data set.
 
     Args:
-        scenarios: one, or several with different ids, which are read one at a time.
-        folder: must not exist or be empty; appears when all is written.
-        split: name of the split of all of them, or a function from scenario to split.
-        license_note: license of the data, for the manifest.
-        provenance: origin of the data in plain JSON values, for the manifest.
+        scenarios: A scenario, or several with different ids, read in turn, never all in memory.
+        folder: Folder that must not exist or be empty; appears when all scenarios are written.
+        split: Name of the split of all scenarios, or a function from scenario to split.
+        license_note: License of the data, for the manifest.
+        provenance: Origin of the data in plain JSON values, for the manifest.
+        scenarios_per_shard: Number of scenarios in a shard; smaller shards are fetched and read faster.
 
     Returns:
         The manifest written.
 
     Raises:
-        ConfigError: there is no scenario, or something else is among them.
-        DataError: the folder is not empty or cannot be written to, a scenario id occurs twice, an array has another
+        ConfigError: No scenario, or a value of a different type among the scenarios.
+        DataError: The folder is not empty or cannot be written to, a scenario id occurs twice, an array has another
             dtype than `types.py` says, a valid state or map point is not finite (names scenario, agent and step), an
             object id occurs twice, a type is unknown, a size is not above zero, or the ego is no track.
     """
-    with DatasetWriter(folder, license_note=license_note, provenance=provenance) as writer:
-        is_empty = True
-        for scenario in [scenarios] if isinstance(scenarios, Scenario) else scenarios:
-            is_empty = False
-            if not isinstance(scenario, Scenario):
-                raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
-            writer.add(scenario, split(scenario) if callable(split) else split)
-        if is_empty:
+    folder = validate_folder(folder)
+    check_folder(folder, "data set")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(f"{folder} is not an empty folder: choose another one or delete it")
+    # beside the folder, so that renaming it never crosses file systems
+    temporary = folder.absolute().with_name(f".{folder.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        with errors_name(folder):
+            (temporary / SHARDS).mkdir(parents=True)
+        scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
+        entries = _write_shards(temporary, scenarios, split, scenarios_per_shard)
+        if not entries:
             raise ConfigError(f"no scenario to write to {folder}: hand over at least one.")
+        write_index_and_manifest(temporary, entries, license_note=license_note, provenance=provenance)
+        # the complete folder is renamed, so no reader ever sees half a data set
+        if folder.exists():
+            folder.rmdir()
+        os.replace(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)  # still there after an error alone
     return read_manifest(folder)
 
 
-def dataset_folder(name: str | os.PathLike[str]) -> Path:
-    """Folder of a data set, "~" expanded; "synthetic" names the one that ships with the package.
+def _write_shards(
+    folder: Path, scenarios: Iterable[Scenario], split: str | Callable[[Scenario], str], scenarios_per_shard: int
+) -> list[ShardEntry]:
+    entries, ids = [], set()
+    for shard, numbered in groupby(enumerate(scenarios), lambda pair: pair[0] // scenarios_per_shard):
+        with ShardWriter(folder / SHARDS / f"{shard:05d}.arrow") as writer:
+            for _, scenario in numbered:
+                if not isinstance(scenario, Scenario):
+                    raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
+                if scenario.scenario_id in ids:
+                    raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
+                writer.add(scenario, split(scenario) if callable(split) else split)
+                ids.add(scenario.scenario_id)
+        entries.append(describe_shard(folder, writer.path, writer.num_rows))
+    return entries
 
-    Of a remote data set (s3://...), a local folder with its index and manifest.
+
+def dataset_folder(name: str | os.PathLike[str]) -> Path:
+    """Folder of a data set, "~" expanded; "synthetic" names the data set that ships with the package.
+
+    Of a remote data set (s3://...), a local folder with index and manifest.
     """
     if is_url(name):
         return mirror(str(name), (INDEX, MANIFEST))
@@ -405,9 +333,9 @@ def describe_shard(folder: Path, path: Path, num_rows: int) -> ShardEntry:
     """Entry of the manifest for a shard of scenarios that were not converted from a file.
 
     Args:
-        folder: the data set.
-        path: the shard, inside the folder.
-        num_rows: scenarios in it.
+        folder: Folder of the data set, which the manifest describes.
+        path: Path of the shard, inside the folder.
+        num_rows: Number of scenarios in the shard.
     """
     return ShardEntry(file=path.relative_to(folder).as_posix(), sha256=hash_file(path), num_rows=num_rows)
 
@@ -424,16 +352,16 @@ def write_index_and_manifest(
     Of scenarios with the same id only the first is in the index.
 
     Args:
-        folder: the data set.
-        entries: its shards, in any order.
-        license_note: license of the data.
-        provenance: origin of the data in plain JSON values.
+        folder: Folder of the data set, with the shards in place.
+        entries: Entries of the shards, in any order.
+        license_note: License of the data, for people who receive the data set.
+        provenance: Origin of the data in plain JSON values, such as the seed of a generator.
 
     Returns:
         The manifest written.
 
     Raises:
-        DataError: a shard is damaged, or the folder cannot be written to.
+        DataError: A shard is damaged, or the folder cannot be written to.
     """
     # sorted: the index must not depend on the order in which processes finished
     entries = sorted(entries, key=lambda entry: entry.file)
@@ -456,7 +384,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
     """Manifest of a data set.
 
     Raises:
-        DataError: no data set there, an unfinished or damaged one, or one of another schema version.
+        DataError: No data set in the folder, an unfinished or damaged one, or a wrong schema version.
     """
     folder = dataset_folder(folder)
     if (folder / INCOMPLETE).exists():
@@ -475,8 +403,8 @@ def parse_manifest(folder: Path) -> Manifest:
     if values.get("format") != FORMAT:
         raise DataError(f"{folder / MANIFEST} is not the manifest of a data set of scenarios")
     if values.get("schema_version") != SCHEMA_VERSION:
-        found = values.get("schema_version")
-        raise DataError(f"{folder} has schema version {found}, this rlftsim reads {SCHEMA_VERSION}: convert again")
+        version = values.get("schema_version")
+        raise DataError(f"{folder} has schema version {version}, this rlftsim reads {SCHEMA_VERSION}: convert again")
     try:
         shards = tuple(shard_entry_from_json(shard) for shard in values.pop("shards"))
         duplicates = tuple(_skipped_from_json(duplicate) for duplicate in values.pop("duplicates"))
@@ -493,21 +421,20 @@ def parse_manifest(folder: Path) -> Manifest:
 def _missing_manifest_hint(folder: Path) -> str:
     """Cause and remedy where a folder has no manifest."""
     if not folder.exists():
-        near = difflib.get_close_matches(str(folder), [SYNTHETIC], n=1)
-        return "there is no such folder" + (f", did you mean {SYNTHETIC!r}?" if near else "")
+        matches = difflib.get_close_matches(str(folder), [SYNTHETIC], n=1)
+        return "there is no such folder" + (f", did you mean {SYNTHETIC!r}?" if matches else "")
     # also one level down: WOMD has a folder per split
     has_source = any(next(folder.glob(pattern), None) for pattern in ("*.tfrecord*", "*/*.tfrecord*"))
-    remedy = (
-        "its tfrecord files have to be converted first" if has_source else "name a folder that `rlftsim convert` wrote"
-    )
-    return f"it has no {MANIFEST}; {remedy}, or {SYNTHETIC!r}"
+    if has_source:
+        return f"it has no {MANIFEST}; its tfrecord files have to be converted first, or {SYNTHETIC!r}"
+    return f"it has no {MANIFEST}; name a folder that `rlftsim convert` wrote, or {SYNTHETIC!r}"
 
 
 def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
     """Inverse of `asdict` for a shard's entry.
 
     Raises:
-        KeyError, TypeError, ConfigError: It lacks a value, or has an unknown one or one of another type.
+        KeyError, TypeError, ConfigError: A value is missing, unknown or of a wrong type.
     """
     skipped = tuple(_skipped_from_json(record) for record in values["skipped"])
     entry = ShardEntry(**{**values, "skipped": skipped})
@@ -534,8 +461,8 @@ def write_json(path: Path, values: Mapping[str, object]) -> None:
     """Write plain values as JSON, whole or not at all.
 
     Args:
-        path: the file.
-        values: anything that JSON has.
+        path: File to write; an existing file is replaced.
+        values: Values of the types that JSON has, by key.
     """
     write_text(path, json.dumps(values, indent=1, sort_keys=True) + "\n")
 
@@ -544,7 +471,7 @@ def load_index(folder: Path) -> pa.Table:
     """Index file of a data set.
 
     Raises:
-        DataError: the file is missing or damaged.
+        DataError: The file is missing or damaged.
     """
     try:
         index = read_parquet(folder / INDEX, "convert again")
@@ -558,42 +485,40 @@ def load_index(folder: Path) -> pa.Table:
 
 
 def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:
-    """Index of the given shards, read from them, and the scenarios left out because an earlier one has the same id.
+    """Index of the given shards, read from the files, and the scenarios left out because an id occurs twice.
 
     Args:
-        folder: the data set.
-        entries: its shards in the order of the index.
+        folder: Folder of the data set, with the shards in place.
+        entries: Entries of the shards, in the order of the index.
     """
     entries = list(entries)
     names = names_of_shards(entries)
-    tables, duplicates, first_place = [], [], {}
+    tables, duplicates, first_locations = [], [], {}
     for entry in entries:
         rows = ShardReader(folder / entry.file).index_rows()
-        keep = []
+        is_first = []
         ids, records, splits = (rows[column].to_pylist() for column in ("scenario_id", "source_record", "split"))
         for row, (scenario_id, record, split) in enumerate(zip(ids, records, splits)):
             # the first of equal ids is indexed; the others stay in their shards, reported as duplicates
-            keep.append(scenario_id not in first_place)
+            is_first.append(scenario_id not in first_locations)
             record = row if record is None else record
-            if keep[-1]:
-                first_place[scenario_id] = (f"{names[entry.file]} record {record}", split)
+            location = f"{names[entry.file]} record {record}"
+            location, first_split = first_locations.setdefault(scenario_id, (location, split))
+            if is_first[-1]:
                 continue
-            place, first_split = first_place[scenario_id]
-            cause = f"scenario {scenario_id} is already in {place}; the first is kept"
+            cause = f"scenario {scenario_id} is already in {location}; the first is kept"
             if split != first_split:
                 cause += f", in split {first_split}: to have it in split {split}, convert to another folder"
             duplicates.append(SkippedRecord(names[entry.file], record, cause))
         table = rows.drop_columns("source_record")
         table = table.append_column("shard", pa.array([entry.file] * len(table), pa.string()))
         table = table.append_column("row", pa.array(range(len(table)), pa.int32()))
-        tables.append(table.filter(pa.array(keep, pa.bool_())))
+        tables.append(table.filter(pa.array(is_first, pa.bool_())))
     return pa.concat_tables([INDEX_SCHEMA.empty_table(), *tables]).combine_chunks(), duplicates
 
 
 def names_of_shards(entries: Iterable[ShardEntry]) -> dict[str, str]:
-    """Name in messages by shard file: that of its source, or the file where the source has several shards or none."""
+    """Name in messages by shard file: the source, or the file where the source has not exactly one shard."""
     entries = list(entries)
     num_shards = Counter(entry.source for entry in entries)
-    return {
-        entry.file: entry.source if entry.source and num_shards[entry.source] == 1 else entry.file for entry in entries
-    }
+    return {entry.file: (num_shards[entry.source] == 1 and entry.source) or entry.file for entry in entries}

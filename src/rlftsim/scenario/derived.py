@@ -1,4 +1,4 @@
-"""Values computed from a scenario, cached for as long as the scenario itself is in memory."""
+"""Values computed from a scenario, cached for as long as the scenario is in memory."""
 
 from collections.abc import Callable, Hashable
 from functools import wraps
@@ -8,25 +8,25 @@ from weakref import WeakKeyDictionary
 from rlftsim.scenario.types import Scenario
 
 Value = TypeVar("Value")
-More = ParamSpec("More")
+Arguments = ParamSpec("Arguments")
 
 
 def cached_on_scenario(
-    compute: Callable[Concatenate[Scenario, More], Value],
-) -> Callable[Concatenate[Scenario, More], Value]:
+    compute: Callable[Concatenate[Scenario, Arguments], Value],
+) -> Callable[Concatenate[Scenario, Arguments], Value]:
     """Decorator that caches a function of a scenario, and of further hashable arguments, with the scenario.
 
-    The values go when the scenario goes.
+    The values are dropped together with the scenario.
     """
     # weak keys: the cache must not keep a scenario in memory that its data set has dropped
-    known: WeakKeyDictionary[Scenario, dict[Hashable, Value]] = WeakKeyDictionary()
+    cache: WeakKeyDictionary[Scenario, dict[Hashable, Value]] = WeakKeyDictionary()
 
     @wraps(compute)
-    def remembered(scenario: Scenario, *more: More.args, **named: More.kwargs) -> Value:
-        values = known.setdefault(scenario, {})
-        key = (more, tuple(named.items()))
+    def remembered(scenario: Scenario, *arguments: Arguments.args, **named: Arguments.kwargs) -> Value:
+        values = cache.setdefault(scenario, {})
+        key = (arguments, tuple(named.items()))
         if key not in values:
-            values[key] = compute(scenario, *more, **named)
+            values[key] = compute(scenario, *arguments, **named)
         return values[key]
 
     return remembered

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
+from rlftsim.scenario.maneuver import Maneuver, classify_turn
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 
 AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
@@ -38,11 +38,11 @@ def compute_index_row(scenario: Scenario, split: str) -> IndexRow:
     """Row of a scenario in the index of a data set.
 
     Args:
-        scenario: its agents are counted at the current step.
-        split: name of its split.
+        scenario: Scenario whose agents are counted at the current step.
+        split: Name of the split that the scenario belongs to, such as "training".
     """
     agent_types = scenario.tracks.object_type[scenario.simulated_indices]
-    count = {kind: int((agent_types == kind).sum()) for kind in ObjectType}
+    count = {object_type: int((agent_types == object_type).sum()) for object_type in ObjectType}
     return IndexRow(
         scenario_id=scenario.scenario_id,
         split=split,
@@ -80,5 +80,5 @@ def classify_ego_maneuver(scenario: Scenario) -> Maneuver:
         return Maneuver.STATIONARY
     # unwrapped, so that a turn through pi counts as the small turn it is
     heading = np.unwrap(tracks.heading[ego, steps].astype(np.float64))
-    maneuver = maneuver_of_turn(float(heading[-1] - heading[0]))
+    maneuver = classify_turn(float(heading[-1] - heading[0]))
     return Maneuver.UTURN if maneuver in (Maneuver.LEFT_UTURN, None) else maneuver

@@ -1,4 +1,4 @@
-"""Checks of a data set (is it whole, is its content plausible) and statistics of its content."""
+"""Checks of a data set, of its files and contents, and statistics of the contents."""
 
 import os
 from collections import Counter
@@ -20,15 +20,9 @@ from rlftsim.scenario.dataset import (
     load_index,
     read_manifest,
 )
+from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import ShardReader, hash_file
-from rlftsim.scenario.types import (
-    CURRENT_STEP,
-    LANE_TYPES,
-    ROAD_EDGE_TYPES,
-    STEP_S,
-    ObjectType,
-    Scenario,
-)
+from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, STEP_S, ObjectType, Scenario
 
 TELEPORT_SPEED_MPS = 60.0
 FAR_MAP_M = 200.0
@@ -36,7 +30,7 @@ FAR_MAP_M = 200.0
 
 
 class Problem(StrEnum):
-    """Kinds of findings."""
+    """Types of findings."""
 
     MISSING_SHARD = "missing shard"
     DAMAGED_SHARD = "damaged shard"
@@ -53,26 +47,26 @@ class Problem(StrEnum):
 
     @property
     def is_damage(self) -> bool:
-        """True: files are not as they were written. False: they are, but the logged content is doubtful."""
+        """True: files are not as written. False: files are sound, but the logged content is doubtful."""
         return self in (Problem.MISSING_SHARD, Problem.DAMAGED_SHARD, Problem.INDEX_MISMATCH)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong with a data set."""
+    """A problem of a data set."""
 
     problem: Problem
-    where: str
+    location: str
     """File inside the data set, or scenario id."""
     detail: str
 
     def __str__(self) -> str:
-        return f"{self.problem}: {self.where}: {self.detail}"
+        return f"{self.problem}: {self.location}: {self.detail}"
 
 
 @dataclass(frozen=True)
 class SpeedStats:
-    """Speeds of valid states of agents of one type, in meters per second."""
+    """Speeds of valid states of agents of a type, in meters per second."""
 
     mean_mps: float
     p95_mps: float
@@ -104,7 +98,7 @@ class DatasetStats:
 
 
 def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
-    """Check every shard and every scenario of a data set.
+    """Findings in every shard and every scenario of a data set.
 
     Damage: shards missing or not as the manifest has them, index and manifest that do not belong together, a scenario
     that is in the index twice. Doubtful content: steps that are not 0.1 s apart, ids that occur twice, impossible ids,
@@ -114,17 +108,17 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     more, no agent to evaluate beside the ego.
 
     Args:
-        folder: the data set, or "synthetic".
+        folder: Folder of the data set, or "synthetic".
 
     Returns:
-        The findings, damage first; empty if all is well.
+        The findings, damage first; empty for a sound data set.
 
     Raises:
-        DataError: there is no finished data set in the folder.
+        DataError: No finished data set in the folder.
     """
     folder = dataset_folder(folder)
     manifest = read_manifest(folder)
-    damage, content, seen = [], [], set()
+    damage, content, checked_ids = [], [], set()
     for entry in manifest.shards:
         path = folder / entry.file
         if not path.exists():
@@ -132,7 +126,7 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
         elif hash_file(path) != entry.sha256:
             damage.append(Finding(Problem.DAMAGED_SHARD, entry.file, "its checksum does not match: convert again"))
         else:
-            content.extend(_check_shard(path, entry.file, seen))
+            content.extend(_check_shard(path, entry.file, checked_ids))
     if not damage:  # the index is rebuilt from the shards, which takes whole ones
         damage.extend(_check_index(folder, manifest))
     return damage + [f for f in content if f.problem.is_damage] + [f for f in content if not f.problem.is_damage]
@@ -141,22 +135,20 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
 def dataset_stats(
     folder: str | os.PathLike[str], *, split: str | None = None, max_speed_scenarios: int = 200
 ) -> DatasetStats:
-    """Summary of a data set or one split of it.
+    """Summary of a data set or of a split.
 
     Args:
-        folder: the data set, or "synthetic".
-        split: only this split; None = all.
-        max_speed_scenarios: speeds are taken from at most so many scenarios, spread evenly over the index.
+        folder: Folder of the data set, or "synthetic".
+        split: Split to summarize, such as "training"; None = all splits.
+        max_speed_scenarios: Number of scenarios, spread evenly over the index, that speeds are taken from at most.
 
     Raises:
-        DataError: no data set there, an unfinished or damaged one, or it has no such split.
+        DataError: No data set in the folder, an unfinished or damaged data set, or no such split.
     """
     dataset = ScenarioDataset(folder, split, cache_size=0)
     index = dataset.index
     num_scenarios = max(len(dataset), 1)
-    agents = {
-        kind: int(sum(index[f"num_{kind}"].to_pylist())) for kind in ("vehicles", "pedestrians", "cyclists", "others")
-    }
+    agents = {name.removeprefix("num_"): int(sum(index[name].to_pylist())) for name in AGENT_COLUMNS}
     positions = np.unique(np.linspace(0, len(dataset) - 1, min(max_speed_scenarios, len(dataset))).astype(int))
     # a shard holds scenarios of all splits, so the size is that of the whole data set
     total_bytes = sum((dataset.folder / entry.file).stat().st_size for entry in dataset.manifest.shards)
@@ -179,70 +171,67 @@ def dataset_stats(
     )
 
 
-def check_scenario(scenario: Scenario) -> Iterator[Finding]:
-    """Doubtful content of one scenario, at most one finding of each kind."""
-    where, tracks, lights = scenario.scenario_id, scenario.tracks, scenario.lights
-    try:
-        scenario.check_consistency()
-    except DataError as error:
-        # The other checks rely on these.
-        yield Finding(Problem.BROKEN, where, str(error))
-        return
-    try:
-        scenario.check_finite_arrays()
-    except DataError as error:
-        yield Finding(Problem.NOT_FINITE, where, str(error))
-    try:
-        scenario.check_precision()
-    except DataError as error:
-        yield Finding(Problem.FAR_FROM_ORIGIN, where, str(error))
+def find_problems(scenario: Scenario) -> Iterator[Finding]:
+    """Doubtful content of a scenario, at most 1 finding of each type."""
+    scenario_id, tracks, lights = scenario.scenario_id, scenario.tracks, scenario.lights
+    checks = {
+        Problem.BROKEN: scenario.check_consistency,
+        Problem.NOT_FINITE: scenario.check_finite_arrays,
+        Problem.FAR_FROM_ORIGIN: scenario.check_precision,
+    }
+    for problem, check in checks.items():
+        try:
+            check()
+        except DataError as error:
+            yield Finding(problem, scenario_id, str(error))
+            if problem == Problem.BROKEN:  # later checks rely on a consistent scenario
+                return
 
     # Different states of one lane at one step. Repeated equal observations are no contradiction.
     observed = np.unique(np.stack([lights.step, lights.lane_id, lights.state], axis=1), axis=0)
-    places, count = np.unique(observed[:, :2], axis=0, return_counts=True)
-    bad = np.flatnonzero(count > 1)
-    if len(bad):
-        step, lane = places[bad[0]]
-        detail = f"lane {lane} has {count[bad[0]]} different states at step {step}{_and_more(len(bad))}"
-        yield Finding(Problem.CONTRADICTORY_LIGHTS, where, detail)
+    lane_steps, count = np.unique(observed[:, :2], axis=0, return_counts=True)
+    entries = np.flatnonzero(count > 1)
+    if len(entries):
+        step, lane = lane_steps[entries[0]]
+        detail = f"lane {lane} has {count[entries[0]]} different states at step {step}{_format_repeats(len(entries))}"
+        yield Finding(Problem.CONTRADICTORY_LIGHTS, scenario_id, detail)
 
     contradictions = describe_contradictions(tracks, scenario.map_features, scenario.guessed)
     if contradictions:
-        yield Finding(Problem.CONTRADICTORY_MOTION, where, contradictions)
+        yield Finding(Problem.CONTRADICTORY_MOTION, scenario_id, contradictions)
 
     # Jumps between two valid states that no road user makes.
     with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
         moved = np.diff(tracks.position[..., :2].astype(np.float64), axis=1)  # [O, S-1, 2]
     both_valid = tracks.valid[:, 1:] & tracks.valid[:, :-1]
     speed = np.where(both_valid, np.hypot(moved[..., 0], moved[..., 1]), 0.0) / STEP_S  # [O, S-1]
-    bad = np.argwhere(speed > TELEPORT_SPEED_MPS)
-    if len(bad):
-        track, step = bad[0]
-        moves = f"track {tracks.object_id[track]} moves {speed[track, step] * STEP_S:.1f} m"
-        yield Finding(Problem.TELEPORT, where, f"{moves} from step {step} to {step + 1}{_and_more(len(bad))}")
+    entries = np.argwhere(speed > TELEPORT_SPEED_MPS)
+    if len(entries):
+        track, step = entries[0]
+        detail = f"track {tracks.object_id[track]} moves {speed[track, step] * STEP_S:.1f} m from step {step} to "
+        yield Finding(Problem.TELEPORT, scenario_id, f"{detail}{step + 1}{_format_repeats(len(entries))}")
 
     features = scenario.map_features
-    kinds = (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
-    missing = [name for name, types in kinds if not len(features.find_indices(types))]
+    required = (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
+    missing = [name for name, types in required if not len(features.find_indices(types))]
     if missing:
         detail = f"no {' and no '.join(missing)}" if len(features.points) else "no map features"
-        yield Finding(Problem.MISSING_MAP, where, detail)
+        yield Finding(Problem.MISSING_MAP, scenario_id, detail)
     if len(features.points) and tracks.valid[scenario.ego_index, CURRENT_STEP]:
-        # NaN of either is no finding of its own
+        # NaN of either is no separate finding
         nearest = np.linalg.norm(features.points[:, :2] - scenario.origin, axis=-1).min()
         if nearest > FAR_MAP_M:
             detail = f"its nearest point is {nearest:.0f} m from the ego: give map and tracks the same origin"
-            yield Finding(Problem.MAP_ELSEWHERE, where, detail)
+            yield Finding(Problem.MAP_ELSEWHERE, scenario_id, detail)
     if not (scenario.evaluated_indices != scenario.ego_index).any():
-        rest = (
-            "only the ego is evaluated" if len(scenario.evaluated_indices) else "nor is the ego: nothing is evaluated"
-        )
-        detail = f"no track to predict is valid at the current step, {rest}"
-        yield Finding(Problem.NO_EVALUATED_AGENTS, where, detail)
+        has_ego = len(scenario.evaluated_indices) > 0
+        consequence = "only the ego is evaluated" if has_ego else "nor is the ego: nothing is evaluated"
+        detail = f"no track to predict is valid at the current step, {consequence}"
+        yield Finding(Problem.NO_EVALUATED_AGENTS, scenario_id, detail)
 
 
-def _check_shard(path: Path, name: str, seen: set[str]) -> Iterator[Finding]:
-    """Findings in one shard. Scenarios whose id was seen before are in no index and not checked again."""
+def _check_shard(path: Path, name: str, checked_ids: set[str]) -> Iterator[Finding]:
+    """Findings in a shard. Scenarios with an id of an earlier shard are in no index and not checked again."""
     try:
         reader = ShardReader(path)
     except DataError as error:
@@ -254,13 +243,13 @@ def _check_shard(path: Path, name: str, seen: set[str]) -> Iterator[Finding]:
         except DataError as error:
             yield Finding(Problem.DAMAGED_SHARD, name, str(error))
         else:
-            if scenario.scenario_id not in seen:
-                yield from check_scenario(scenario)
-            seen.add(scenario.scenario_id)
+            if scenario.scenario_id not in checked_ids:
+                yield from find_problems(scenario)
+            checked_ids.add(scenario.scenario_id)
 
 
 def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
-    """Findings in the index: it must be the manifest's, and its rows those of the shards."""
+    """Findings in the index, which must be the manifest's, with the rows of the shards."""
     path = folder / INDEX
     if not path.exists() or hash_file(path) != manifest.index_sha256:
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "it is not the one the manifest was written for: convert again")
@@ -269,10 +258,10 @@ def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
     shards: dict[str, list[str]] = {}
     for scenario_id, shard in zip(index["scenario_id"].to_pylist(), index["shard"].to_pylist()):
         shards.setdefault(scenario_id, []).append(shard)
-    repeated = [scenario_id for scenario_id, places in shards.items() if len(places) > 1]
+    repeated = [scenario_id for scenario_id, shard_names in shards.items() if len(shard_names) > 1]
     if repeated:
-        places = " and ".join(shards[repeated[0]])
-        detail = f"scenario {repeated[0]} is in it from {places}{_and_more(len(repeated))}"
+        shard_names = " and ".join(shards[repeated[0]])
+        detail = f"scenario {repeated[0]} is in it from {shard_names}{_format_repeats(len(repeated))}"
         yield Finding(Problem.INDEX_MISMATCH, INDEX, f"{detail}: convert one of the sources again, the first is kept")
         return
     expected, duplicates = build_index(folder, manifest.shards)
@@ -283,7 +272,7 @@ def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "the manifest's counts are not those of the shards: convert again")
 
 
-def _and_more(count: int) -> str:
+def _format_repeats(count: int) -> str:
     return f" (and {count - 1} more)" if count > 1 else ""
 
 
@@ -293,14 +282,14 @@ def _count(values: list) -> dict:
 
 def _compute_speeds(dataset: ScenarioDataset, positions: np.ndarray) -> dict[str, SpeedStats]:
     """Speeds by type of agent, over the scenarios at some positions of a data set."""
-    by_type: dict[ObjectType, list[np.ndarray]] = {kind: [] for kind in ObjectType}
+    by_type: dict[ObjectType, list[np.ndarray]] = {object_type: [] for object_type in ObjectType}
     for position in positions:
         scenario = dataset[int(position)]
         tracks, agents = scenario.tracks, scenario.simulated_indices
         speed = np.linalg.norm(tracks.velocity[agents].astype(np.float64), axis=-1)
-        for kind, values in by_type.items():
-            values.append(speed[tracks.valid[agents] & (tracks.object_type[agents] == kind)[:, None]])
-    merged = {kind.name.lower(): np.concatenate(values) for kind, values in by_type.items() if values}
+        for object_type, values in by_type.items():
+            values.append(speed[tracks.valid[agents] & (tracks.object_type[agents] == object_type)[:, None]])
+    merged = {object_type.name.lower(): np.concatenate(values) for object_type, values in by_type.items() if values}
     return {
         name: SpeedStats(float(speed.mean()), float(np.quantile(speed, 0.95)), float(speed.max()))
         for name, speed in merged.items()

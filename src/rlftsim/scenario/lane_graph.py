@@ -1,8 +1,8 @@
-"""Lanes of a map as a graph to drive on: center lines and the links between them. Frame: world, meters.
+"""Lanes of a map as a graph to drive on: center lines and links. Frame: world, meters.
 
 Successors follow from the geometry: a lane goes on where another begins. Logs list successors, too, but many sources
-lose the lists. Where a log has them, the geometry gives 99.7 % of their entries (of 25 000 on real maps), and the links
-it gives beyond them are joined without a gap.
+lose the lists. Where a log has them, the geometry gives 99.7 % of their entries (of 25 000 on real maps), and further
+links of the geometry are joined without a gap.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class LaneGraph:
     lane_type: Int64[np.ndarray, "n"]
     """A `MapFeatureType` among `LANE_TYPES`."""
     speed_limit_mps: Float[np.ndarray, "n"]
-    """0 = unknown."""
+    """Speed limits, 0 = unknown."""
     lines: tuple[Float[np.ndarray, "_ 3"], ...]
     """Center lines without repeated points."""
     successors: tuple[tuple[int, ...], ...]
@@ -54,10 +54,10 @@ class LaneGraph:
 
 @cached_on_scenario
 def lane_graph(scenario: Scenario) -> LaneGraph:
-    """The lanes of a scenario's map; without lanes an empty graph."""
+    """Graph of the lanes of a scenario's map; without lanes an empty graph."""
     features = scenario.map_features
     limits = features.topology.speed_limit_mph
-    kept, lines, headings = [], [], []
+    indices, lines, headings = [], [], []
     for index in features.find_indices(LANE_TYPES):
         line = features.polyline(index).astype(np.float64)
         line = line[np.isfinite(line).all(1)]
@@ -68,16 +68,16 @@ def lane_graph(scenario: Scenario) -> LaneGraph:
         if len(line) < 2:
             continue
         # direction at each point: from the point before to the point after
-        ahead, behind = np.append(line[1:], line[-1:], 0), np.append(line[:1], line[:-1], 0)
-        x, y = (ahead - behind)[:, :2].T
-        kept.append(int(index))
+        next_points, last_points = np.append(line[1:], line[-1:], 0), np.append(line[:1], line[:-1], 0)
+        x, y = (next_points - last_points)[:, :2].T
+        indices.append(int(index))
         lines.append(line)
         headings.append(np.arctan2(y, x))
     counts = np.array([len(line) for line in lines], np.int64)
     return LaneGraph(
-        lane_id=features.feature_id[kept],
-        lane_type=features.feature_type[kept].astype(np.int64),
-        speed_limit_mps=np.zeros(len(kept)) if limits is None else limits[kept].astype(np.float64) * MPS_PER_MPH,
+        lane_id=features.feature_id[indices],
+        lane_type=features.feature_type[indices].astype(np.int64),
+        speed_limit_mps=np.zeros(len(indices)) if limits is None else limits[indices].astype(np.float64) * MPS_PER_MPH,
         lines=tuple(lines),
         successors=_successors(lines),
         points=np.concatenate([np.zeros((0, 3)), *lines]),
@@ -99,11 +99,11 @@ def _successors(lines: list[Float[np.ndarray, "_ 3"]]) -> tuple[tuple[int, ...],
     gap = np.linalg.norm(ends[:, None] - starts[None], axis=-1)
     bend = np.abs(wrapped(into[None] - out_of[:, None]))
     joined = (gap <= JOINT_M) & (bend <= JOINT_RAD)
-    np.fill_diagonal(joined, False)  # a closed loop does not follow itself
+    np.fill_diagonal(joined, False)  # a closed loop is no successor of the loop
     return tuple(tuple(np.flatnonzero(row).tolist()) for row in joined)
 
 
-def _directions(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "n"]:
-    """Direction from the first to the last point of each piece, rad."""
-    ways = np.stack([piece[-1] - piece[0] for piece in pieces])
-    return np.arctan2(ways[:, 1], ways[:, 0])
+def _directions(lines: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "n"]:
+    """Direction from the first to the last point of each line, rad."""
+    vectors = np.stack([line[-1] - line[0] for line in lines])
+    return np.arctan2(vectors[:, 1], vectors[:, 0])

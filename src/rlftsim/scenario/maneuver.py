@@ -1,4 +1,4 @@
-"""Maneuvers: names of paths by their change of heading, for the index of a data set and for goal proposals."""
+"""Maneuvers: names of paths by the change of heading, for the index of a data set and for goal proposals."""
 
 from enum import StrEnum
 
@@ -39,11 +39,11 @@ BENCHMARK_MANEUVERS = (
 """The six of the paper's maneuver benchmark, which goals are proposed for."""
 
 
-def maneuver_of_turn(turn_rad: float) -> Maneuver | None:
-    """Maneuver of a path by its change of heading; None for a U-turn to the right, for which the benchmark has no name.
+def classify_turn(turn_rad: float) -> Maneuver | None:
+    """Maneuver of a path by the change of heading; None for a U-turn to the right, for which the benchmark has no name.
 
     Args:
-        turn_rad: heading at the end minus heading at the start, turned continuously.
+        turn_rad: Heading at the end minus heading at the start, turned continuously, rad, counter-clockwise.
     """
     if abs(turn_rad) < STRAIGHT_RAD:
         return Maneuver.STRAIGHT

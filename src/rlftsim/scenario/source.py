@@ -1,4 +1,4 @@
-"""The contract of a data source: units of files, and what reading one yields. Sources by name: `scenario.sources`."""
+"""The contract of a data source: units of files, and the items of each. Sources by name: `scenario.sources`."""
 
 import os
 import re
@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 from rlftsim.errors import BadRecordError, DataError
 from rlftsim.scenario.consistency import describe_contradictions
-from rlftsim.scenario.shards import check_shard
+from rlftsim.scenario.shards import check_scenario
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
 
@@ -19,44 +19,44 @@ CONTRADICTORY = "scenarios whose velocities, headings or heights contradict the 
 
 @dataclass(frozen=True)
 class Unit:
-    """One piece of work of a source. It becomes one shard of the data set."""
+    """A unit of work of a source, which becomes a shard of the data set."""
 
     name: str
-    """Differs from those of all other units of a path; the shard is named after it."""
+    """Name that differs between the units of a path; the shard is named after the unit."""
     files: tuple[Path, ...]
-    """All files that are read for it. When one of them changes, the unit is converted again."""
+    """All files of the unit. When a file changes, the unit is converted again."""
     split: str = "unknown"
     url: str = ""
-    """Address of its only file, where that is not on this machine; then `files` is empty."""
+    """Address of the only file, where the file is not on this machine; then `files` is empty."""
     url_bytes: int = 0
 
     @property
     def size(self) -> int:
-        """Bytes of the files that are there."""
+        """Bytes of the files that exist."""
         return self.url_bytes + sum(file.stat().st_size for file in self.files if file.exists())
 
 
 class BytesRead(int):
-    """Bytes of a unit that were read since the last report: moves the progress bar. Sources may leave them out."""
+    """Bytes of a unit that were read since the last report: moves the progress bar. Sources may omit these reports."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """Something that happened in a unit and that its user should know the number of; sums are in the report."""
+    """Number of events in a unit that the user should know; sums are in the report."""
 
-    what: str
+    event: str
     count: int
 
 
 Item = Scenario | SkippedRecord | BytesRead | Tally
-"""Yielded by a source: a scenario, the cause why a record is none, progress, or something to be counted."""
+"""Yielded by a source: a scenario, the cause why a record is skipped, progress, or a count."""
 
 
 @runtime_checkable
 class DataSource(Protocol):
-    """Reader of one kind of files.
+    """Reader of files of one origin.
 
-    It may also have `detects(path) -> bool`, True for files of its kind, which `convert` calls when no source is named.
+    An optional `detects(path) -> bool` is True for files of this origin; `convert` asks when no source is named.
     Arguments of a source's class are options of `convert`. A source is pickled when several processes convert.
     """
 
@@ -67,22 +67,22 @@ class DataSource(Protocol):
         """Units of work at a path, in a fixed order.
 
         Raises:
-            DataError: there are none.
+            DataError: No unit at the path.
         """
         ...
 
     def read(self, unit: Unit) -> Iterator[Item]:
-        """Scenarios of a unit, the same ones in the same order each time.
+        """Scenarios of a unit, in the same order each time.
 
-        A bad record is yielded as a `SkippedRecord`, so that those after it can still be read. A `DataError` that is
+        A bad record is yielded as a `SkippedRecord`, so that later records can still be read. A `DataError` that is
         raised costs the rest of the unit.
         """
         ...
 
     def describe(self) -> Mapping[str, object]:
-        """Plain JSON values for the provenance in the manifest, above all what had to be guessed.
+        """Plain JSON values for the provenance in the manifest, above all guessed values.
 
-        A unit is converted again when they change.
+        A unit is converted again when the values change.
         """
         ...
 
@@ -96,19 +96,19 @@ def read_unit(
     advance: Callable[[int], object] = lambda _: None,
     tally: Callable[[Tally], object] = lambda _: None,
 ) -> Iterator[tuple[int, Scenario]]:
-    """Read a unit; yields the number of the record, from 0, with its scenario.
+    """Read a unit; yields the number of each record, from 0, with the scenario.
 
     Args:
-        source: reader of the unit.
-        unit: one of those that the source has found.
-        on_error: "stop" raises at the first bad record, "skip" reports it and goes on.
-        report: called with each skipped record, only under "skip".
-        advance: called with the number of bytes read since its last call, if the source counts them.
-        tally: called with what the source counts.
+        source: Data source that reads the unit.
+        unit: Unit that the source's `find` returned.
+        on_error: "stop" raises at the first bad record, "skip" reports the record and goes on.
+        report: Function called with each skipped record, only under "skip".
+        advance: Function called with the number of bytes read since the last call, if the source counts bytes.
+        tally: Function called with each count of the source.
 
     Raises:
-        BadRecordError: under "stop", a bad record: names file, record and cause.
-        DataError: a file cannot be read.
+        BadRecordError: A bad record under "stop"; the message names file, record and cause.
+        DataError: A file cannot be read.
     """
     # Errors of the code that consumes the scenarios do not pass through here: only reading is inside the `try`.
     record = 0
@@ -122,7 +122,7 @@ def read_unit(
                 continue
             if isinstance(item, Scenario):
                 try:
-                    check_shard(item)
+                    check_scenario(item)
                 except DataError as error:
                     item = SkippedRecord(unit.name, record, str(error))
             if isinstance(item, Scenario):
@@ -143,20 +143,20 @@ def read_unit(
 
 
 def units_of_files(files: Sequence[Path]) -> list[Unit]:
-    """One unit per file, named by its path below the folder that all of them share.
+    """A unit per file, named by the path below the folder that all files share.
 
     Args:
-        files: at least one.
+        files: Paths of the files, at least 1.
     """
-    common = os.path.commonpath([file.absolute().parent for file in files])
-    return [Unit(file.absolute().relative_to(common).as_posix(), (file,), infer_split(file)) for file in files]
+    root = os.path.commonpath([file.absolute().parent for file in files])
+    return [Unit(file.absolute().relative_to(root).as_posix(), (file,), infer_split(file)) for file in files]
 
 
 def units_of_urls(sizes: Mapping[str, int]) -> list[Unit]:
-    """One unit per remote file, named as by `units_of_files`.
+    """A unit per remote file, named as by `units_of_files`.
 
     Args:
-        sizes: bytes of each file by its address; at least one.
+        sizes: Bytes of each file by address, at least 1 file.
     """
     paths = {url: Path("/" + url.partition("://")[2].lstrip("/")) for url in sizes}
     names = units_of_files(list(paths.values()))
@@ -164,7 +164,7 @@ def units_of_urls(sizes: Mapping[str, int]) -> list[Unit]:
 
 
 def infer_split(path: Path) -> str:
-    """Split by the name of a file or else of its folder: training, validation, testing or unknown."""
+    """Split by the name of a file or else of the folder: training, validation, testing or unknown."""
     for name in (path.name, path.absolute().parent.name):
         match = _SPLIT.search(name)
         if match:

@@ -1,8 +1,8 @@
 """Clusters of scenarios, which share a street network or a recording, and the splits that are drawn by them.
 
 Choices are made on `tune`; `exam` is looked at once. Where a data set stores no splits of these names, a fixed third of
-the clusters of its validation split is `exam` and the others are `tune`. Of generated scenarios `tune` is all of
-validation, because their exam is generated, too: `rlftsim experiment exam`.
+the clusters of the validation split is `exam` and two thirds are `tune`. Of generated scenarios `tune` is all of
+validation, because the exam is generated, too: `rlftsim experiment exam`.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ _AV2_WINDOW = re.compile(r"-(0|19)$")
 
 @runtime_checkable
 class Indexed(Protocol):
-    """What of a data set says which clusters its scenarios belong to."""
+    """Attributes of a data set that say which clusters the scenarios belong to."""
 
     folder: Path
     index: pa.Table
@@ -31,12 +31,12 @@ class Indexed(Protocol):
 
 
 def find_clusters(dataset: Indexed) -> Shaped[np.ndarray, "scenarios"]:
-    """Label of each scenario's street network (synthetic) or recording (Argoverse 2), else its own id.
+    """Label of each scenario's street network (synthetic) or recording (Argoverse 2), else the scenario id.
 
     Scenarios of one label are not independent: statistics count labels.
 
     Args:
-        dataset: Data set, or one split of it; labels come in the order of its positions.
+        dataset: Data set, or one split of it; labels come in the order of the index.
     """
     ids, sources, shards = (dataset.index[name].to_pylist() for name in ("scenario_id", "source", "shard"))
     networks = find_networks(dataset)
@@ -48,10 +48,10 @@ def find_clusters(dataset: Indexed) -> Shaped[np.ndarray, "scenarios"]:
 
 
 def find_networks(dataset: Indexed) -> dict[str, str]:
-    """Street network by shard, of generated scenarios; empty for all others.
+    """Street network by shard, of generated scenarios; empty for logged ones.
 
     Raises:
-        DataError: The manifest is damaged there.
+        DataError: The manifest's list of networks is damaged.
     """
     provenance = dataset.manifest.provenance
     if "networks" not in provenance:
@@ -65,7 +65,7 @@ def find_networks(dataset: Indexed) -> dict[str, str]:
 
 
 def find_split(dataset: Indexed, split: str) -> Bool[np.ndarray, "scenarios"]:
-    """True for the scenarios of a split, stored or drawn, see the module; all False where there is none.
+    """True for the scenarios of a split, stored or drawn, see the module; all False for an unknown split.
 
     Args:
         dataset: Whole data set, all splits.
@@ -81,5 +81,5 @@ def find_split(dataset: Indexed, split: str) -> Bool[np.ndarray, "scenarios"]:
 
 
 def is_in_exam(label: str) -> bool:
-    """True for a third of all labels of clusters: always the same ones, on any machine and in any data set."""
+    """True for a third of all labels of clusters: the same labels on any machine and in any data set."""
     return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8]) % 3 == 0

@@ -23,7 +23,7 @@ OnError = Literal["stop", "skip"]
 _HEADER = struct.Struct("<QI")
 _FOOTER = struct.Struct("<I")
 RECORD_OVERHEAD_BYTES = _HEADER.size + _FOOTER.size
-"""Bytes of a record in the file beside its own."""
+"""Bytes that the framing of a record takes."""
 _MASK_DELTA = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b"
 _REST_IS_LOST = "the rest of the file is lost"
@@ -31,14 +31,14 @@ _REST_IS_LOST = "the rest of the file is lost"
 
 @dataclass(frozen=True)
 class SkippedRecord:
-    """Something of a file that could not be read."""
+    """A record that could not be read."""
 
     file: str
     record: int
     """Number of the record in its file, from 0. Where the rest of the file is lost: the first one lost."""
     cause: str
     rest_is_lost: bool = False
-    """True = nothing behind it in the file could be read either, and nothing says how many records that are."""
+    """True = the file cannot be read from this record on, and the number of lost records is unknown."""
 
     def __str__(self) -> str:
         return f"{self.file}: record {self.record}: {self.cause}"
@@ -56,7 +56,7 @@ def log_skipped(skipped: SkippedRecord) -> None:
 
 def masked_crc32c(data: bytes) -> int:
     """Checksum of `data` as TFRecord files store it, in [0, 2**32)."""
-    # rotated and shifted, so that the checksum of data that holds its own checksum is not degenerate
+    # rotated and shifted, so that the checksum of data with an embedded checksum is not degenerate
     crc = google_crc32c.value(data)
     return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
 
@@ -65,8 +65,8 @@ def write_records(path: str | os.PathLike[str], records: Iterable[bytes]) -> int
     """Write a TFRecord file, replacing an existing one.
 
     Args:
-        path: the file.
-        records: bytes of each record.
+        path: File to write, of any name.
+        records: Content of each record, in the order of the file.
 
     Returns:
         Number of records written.
@@ -86,17 +86,17 @@ def read_records(
     """Read a TFRecord file record by record, checking both checksums of each.
 
     Args:
-        path: the file.
-        on_error: "stop" raises at the first damage; "skip" reports it and goes on with the next record, if that can be
-            found.
-        report: called with each skipped record, only under "skip".
+        path: File to read, of any name.
+        on_error: "stop" raises at the first damage; "skip" reports the damage and goes on with the next record, as far
+            as the framing allows.
+        report: Function called with each skipped record, only under "skip".
 
     Yields:
-        Number of the record in the file, from 0, and its bytes.
+        Number of the record in the file, from 0, and the record's bytes.
 
     Raises:
-        DataError: under "stop", damage: names file, record and cause. Always: the file does not exist or cannot be
-            opened.
+        DataError: Damage under "stop"; the message names file, record and cause. Always: the file does not exist or
+            cannot be opened.
     """
     path = Path(path)
     try:
@@ -108,7 +108,7 @@ def read_records(
         size = os.fstat(file.fileno()).st_size
         record = 0
         while file.tell() < size or size == 0:
-            data, cause = _read_one(file, size, record)
+            data, cause = _read_record(file, size, record)
             if cause is not None:
                 skipped = SkippedRecord(str(path), record, cause, rest_is_lost=data is None)
                 if on_error == "stop":
@@ -121,8 +121,8 @@ def read_records(
             record += 1
 
 
-def _read_one(file: BinaryIO, size: int, record: int) -> tuple[bytes | None, str | None]:
-    """Next record and its damage, None where it is sound; no bytes = the rest of the file cannot be read."""
+def _read_record(file: BinaryIO, size: int, record: int) -> tuple[bytes | None, str | None]:
+    """Next record and the damage, None for a sound record; no bytes = the rest of the file cannot be read."""
     bytes_left = size - file.tell()
     header = file.read(_HEADER.size)
     if bytes_left == 0:
@@ -130,12 +130,10 @@ def _read_one(file: BinaryIO, size: int, record: int) -> tuple[bytes | None, str
     if record == 0 and header.startswith(_GZIP_MAGIC):
         return None, "not a TFRecord file but a gzip-compressed one: unpack it with gunzip first"
     if len(header) < _HEADER.size:
-        too_short = "not a TFRecord file: too short"
-        return (
-            None,
-            too_short if record == 0 else f"truncated: the file ends inside the record's header; {_REST_IS_LOST}",
-        )
-    # the length is trusted only with its own checksum: a wrong one would be read as gigabytes
+        if record == 0:
+            return None, "not a TFRecord file: too short"
+        return None, f"truncated: the file ends inside the record's header; {_REST_IS_LOST}"
+    # the length is trusted only with a matching checksum: a wrong length would be read as gigabytes
     length, crc = _HEADER.unpack(header)
     if crc != masked_crc32c(header[:8]):
         if record == 0:

@@ -1,28 +1,26 @@
-"""One logged traffic scenario: tracks, map, lights.
+"""A logged traffic scenario: tracks, map, lights.
 
 Units: meters, seconds, radians, meters per second. Headings are counter-clockwise from +x. Frame: the *world* frame of
 the log. Coordinates are float32 from reading on, because the official evaluator and the public SMART code round them
-before they do anything else. The one exception is `MapFeatures.polygon_rest`. `Scenario.origin` is in whole meters, so
-that subtracting it is exact.
+first. The exception is `MapFeatures.polygon_rest`. `Scenario.origin` is in whole meters: subtraction is exact.
 
-Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Nothing here
-needs torch.
+Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Torch is not
+needed.
 """
 
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64, Shaped
 
 from rlftsim.errors import DataError, in_short
+from rlftsim.jobs.documents import MAX_NAME_BYTES
 
-MAX_ID_BYTES = 200
-"""Of a scenario id; file systems take names of 255 bytes, and a suffix follows."""
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
@@ -36,7 +34,7 @@ TOTAL_STEPS = 91
 
 
 class ObjectType(IntEnum):
-    """Kind of road user, WOMD's numbers."""
+    """Type of road user, WOMD's numbers."""
 
     UNSET = 0
     VEHICLE = 1
@@ -52,11 +50,11 @@ MEDIAN_SIZE_M = {
 }
 """Length, width and height where a log has none: medians of WOMD (18 631 vehicles, 2 288 pedestrians, 127 cyclists)."""
 OTHER_SIZE_M = (1.0, 1.0, 1.0)
-"""The same for all other objects."""
+"""Length, width and height of objects of further types."""
 
 
 class MapFeatureType(IntEnum):
-    """Kind of map feature; the numbers of WOMD's `roadgraph_samples/type`."""
+    """Type of map feature; the numbers of WOMD's `roadgraph_samples/type`."""
 
     LANE_UNDEFINED = 0
     LANE_FREEWAY = 1
@@ -82,6 +80,7 @@ class MapFeatureType(IntEnum):
 
 LANE_TYPES = (0, 1, 2, 3)
 ROAD_EDGE_TYPES = (14, 15, 16)
+POLYGON_TYPES = (MapFeatureType.CROSSWALK, MapFeatureType.SPEED_BUMP, MapFeatureType.DRIVEWAY)
 
 
 class LightState(IntEnum):
@@ -102,7 +101,7 @@ class LightState(IntEnum):
 class Tracks:
     """Logged objects in file order.
 
-    Where `valid` is False the other fields hold the values of the log, because the metric reads some of them.
+    Where `valid` is False the arrays hold the values of the log, because the metric reads some of these.
     """
 
     object_id: Int64[np.ndarray, "O"]
@@ -115,6 +114,21 @@ class Tracks:
     """Length, width, height of the box."""
     valid: Bool[np.ndarray, "O S"]
 
+    def select(self, objects: Shaped[np.ndarray, "n"]) -> "Tracks":
+        """Tracks of the objects that a mask or indices name."""
+        return Tracks(**{column.name: getattr(self, column.name)[objects] for column in fields(self)})
+
+    def cut(self, steps: slice) -> "Tracks":
+        """Tracks of all objects over some steps."""
+        names = ("position", "heading", "velocity", "size", "valid")
+        return replace(self, **{name: getattr(self, name)[:, steps] for name in names})
+
+
+def to_float32(values: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """Nearest float32. Values out of range become infinite without a warning, and are refused by a check later."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
 
 def _no_rows(columns: int) -> Int64[np.ndarray, "0 columns"]:
     return np.zeros((0, columns), np.int64)
@@ -122,7 +136,7 @@ def _no_rows(columns: int) -> Int64[np.ndarray, "0 columns"]:
 
 @dataclass(frozen=True, eq=False)
 class LaneTopology:
-    """Links between lanes; rows start with a lane's feature id and are in file order. Empty where a source has none."""
+    """Links between lanes; rows start with a lane's feature id and are in file order. Without links all are empty."""
 
     entry_lanes: Int64[np.ndarray, "n_entry 2"] = field(default_factory=lambda: _no_rows(2))
     """lane, lane before it."""
@@ -138,6 +152,17 @@ class LaneTopology:
     """One per map feature, 0 where unknown or no lane."""
     interpolating: Bool[np.ndarray, "F"] | None = None
     """True = the lane joins two others inside a junction."""
+
+    @classmethod
+    def of(cls, **columns: Any) -> "LaneTopology":
+        """Links row by row.
+
+        Args:
+            columns: Fields by name; tables of links as lists of rows, without rows or left out where there are none.
+        """
+        tables = {name: table for name, table in vars(cls()).items() if table is not None and name in columns}
+        rows = {name: np.array(columns[name], np.int64).reshape(-1, table.shape[1]) for name, table in tables.items()}
+        return cls(**columns | rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,20 +182,34 @@ class MapFeatures:
     """
 
     @classmethod
-    def of(cls, features: Iterable[tuple[int, int, np.ndarray]], topology: LaneTopology | None = None) -> "MapFeatures":
+    def of(
+        cls,
+        features: Iterable[tuple[int, int, np.ndarray]],
+        topology: LaneTopology | None = None,
+        *,
+        has_polygon_rest: bool = False,
+    ) -> "MapFeatures":
         """Map of features one by one.
 
         Args:
-            features: feature id, `MapFeatureType` number and points [n, 3] of each, in the order of the map.
-            topology: links between its lanes; None = none.
+            features: Feature id, `MapFeatureType` number and points [n, 3] of each, in the order of the map.
+            topology: Links between the lanes; None = lanes without links.
+            has_polygon_rest: True keeps the rounding error of polygons.
         """
         ids, types, lines = zip(*features) if (features := list(features)) else ((), (), ())
+        lengths = np.array([len(line) for line in lines], np.int64)
+        exact = np.concatenate([np.zeros((0, 3)), *lines])  # [P, 3] float64
+        points, error = to_float32(exact), np.zeros_like(exact)
+        # only of finite points: infinity minus infinity would warn before the point is refused by name
+        is_polygon = np.repeat(np.isin(types, POLYGON_TYPES), lengths)[:, None]
+        np.subtract(exact, points, out=error, where=is_polygon & np.isfinite(points))
         return cls(
             feature_id=np.array(ids, np.int64),
             feature_type=np.array(types, np.int8),
-            points=np.concatenate([np.zeros((0, 3)), *lines]).astype(np.float32),
-            offsets=np.append(0, np.cumsum([len(line) for line in lines])).astype(np.int64),
+            points=points,
+            offsets=np.append(0, np.cumsum(lengths)),
             topology=topology or LaneTopology(),
+            polygon_rest=to_float32(error) if has_polygon_rest else None,
         )
 
     def __len__(self) -> int:
@@ -183,8 +222,8 @@ class MapFeatures:
     def polygon(self, index: int | np.integer) -> Float64[np.ndarray, "n 3"]:
         """Points of a crosswalk, bump or driveway, world frame, in the precision of the source."""
         polygon = self.polyline(index).astype(np.float64)
-        own = slice(self.offsets[index], self.offsets[index + 1])
-        return polygon if self.polygon_rest is None else polygon + self.polygon_rest[own]
+        span = slice(self.offsets[index], self.offsets[index + 1])
+        return polygon if self.polygon_rest is None else polygon + self.polygon_rest[span]
 
     def find_indices(self, types: tuple[int, ...]) -> Int64[np.ndarray, "n"]:
         """Indices of the features of the given types, in file order."""
@@ -193,20 +232,31 @@ class MapFeatures:
 
 @dataclass(frozen=True, eq=False)
 class LightStates:
-    """Traffic light observations, one row each, by step, then in the log's order (a lane may occur twice)."""
+    """Traffic light observations, a row each, by step, then in the log's order (a lane may occur twice)."""
 
     step: Int32[np.ndarray, "K"]
     lane_id: Int64[np.ndarray, "K"]
     state: Int8[np.ndarray, "K"]
     stop_point: Float32[np.ndarray, "K 3"]
 
+    @classmethod
+    def of(cls, rows: Sequence[tuple[int, int, int, Any, Any, Any]]) -> "LightStates":
+        """Light states of observations one by one.
+
+        Args:
+            rows: Step, lane id, `LightState` number, and x, y, z of the stop point in meters, world frame.
+        """
+        step, lane_id, state, *point = zip(*rows) if rows else ((),) * 6
+        stop_point = to_float32(np.array(point, np.float64).T.reshape(-1, 3))
+        return cls(np.array(step, np.int32), np.array(lane_id, np.int64), np.array(state, np.int8), stop_point)
+
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """One logged scenario. Compared and hashed by identity, so that values derived from it can be cached.
+    """A logged scenario. Compared and hashed by identity, so that values computed from a scenario can be cached.
 
-    Its arrays must not change for the same reason, and those of a data set are read-only: a changed scenario is made
-    with `dataclasses.replace` and copies.
+    Arrays must not change for the same reason, and arrays of a data set are read-only: a changed scenario is made with
+    `dataclasses.replace` and copies.
     """
 
     scenario_id: str
@@ -222,43 +272,44 @@ class Scenario:
     objects_of_interest: Int64[np.ndarray, "m"]
     """Object ids."""
     source: str = "unknown"
-    """Name of the data source that it was read by, such as "womd"."""
+    """Name of the data source that read the log, such as "womd"."""
     guessed: frozenset[str] = frozenset()
     """Values that the log lacks and the data source made up, such as "size" and "z"."""
 
     def check_scenario_id(self) -> None:
-        """Check that the id can be a file name: films and rollouts are named after their scenario.
+        """Check that the id can be a file name: films and rollouts are named after the scenario.
 
         Raises:
-            DataError: it is no text or empty, too long, or has a slash or a control character.
+            DataError: The id is no text, empty, too long, or has a slash or a control character.
         """
         name = self.scenario_id
-        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_ID_BYTES
+        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_NAME_BYTES
         if not is_text or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
             raise DataError(
                 f"scenario id {in_short(name)} is no file name, and files are named after it: write it as text of at "
-                f"most {MAX_ID_BYTES} bytes without slashes and control characters"
+                f"most {MAX_NAME_BYTES} bytes without slashes and control characters"
             )
 
     def check_array_shapes(self) -> None:
-        """Check that tracks, map and lights hold arrays with the axes that their classes declare.
+        """Check that tracks, map and lights hold arrays with the axes that the classes declare.
 
         Raises:
-            DataError: something else, or an axis of another length than in the arrays before it.
+            DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
         features = self.map_features
-        parts = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
-        for place, part in parts.items():
-            _check_shapes(part, place)
+        _check_shapes(self.tracks, "tracks")
+        _check_shapes(features, "map")
+        _check_shapes(features.topology, "topology")
+        _check_shapes(self.lights, "lights")
 
     def check_consistency(self) -> None:
         """Check what every reader relies on: steps of 0.1 s, track indices, ids that differ, types, states, sizes, map.
 
-        Sizes are those at the current step: simulation and metric read no others, and logs hold zeros where a state is
-        not valid.
+        Sizes are checked at the current step: simulation and metric read no further sizes, and logs hold zeros where a
+        state is not valid.
 
         Raises:
-            DataError: names the track, map feature, light or index, and its value.
+            DataError: A value breaks a rule; the message names track, map feature, light or index, and the value.
         """
         tracks = self.tracks
         if self.num_steps < HISTORY_STEPS:
@@ -292,50 +343,46 @@ class Scenario:
             )
 
     def check_finite_arrays(self) -> None:
-        """Check every valid state and every map point.
+        """Check that every valid state and every map point is finite.
 
         Raises:
-            DataError: one holds a NaN or an infinite number. Names track, step and field, or map feature and point.
+            DataError: A NaN or an infinite number; the message names track, step and field, or map feature and point.
         """
         tracks = self.tracks
-        fields = {
-            "position": tracks.position,
-            "heading": tracks.heading[..., None],
-            "velocity": tracks.velocity,
-            "size": tracks.size,
-        }
-        for name, values in fields.items():
-            bad = np.argwhere(tracks.valid & ~np.isfinite(values).all(-1))  # [n, 2] rows of (track, step)
-            if len(bad):
-                track, step = bad[0]
+        for name in ("position", "heading", "velocity", "size"):
+            is_finite = np.isfinite(getattr(tracks, name))
+            is_finite = is_finite if name == "heading" else is_finite.all(-1)
+            entries = np.argwhere(tracks.valid & ~is_finite)  # [n, 2] rows of (track, step)
+            if len(entries):
+                track, step = entries[0]
                 raise DataError(
                     f"track {tracks.object_id[track]} has a NaN or infinite {name} at step {step}, where it is marked "
                     "valid: correct the value or mark the state as not valid"
                 )
         lines = self.map_features
-        bad_points = np.flatnonzero(~np.isfinite(lines.points).all(1))
-        if len(bad_points):
-            owner = np.searchsorted(lines.offsets, bad_points[0], side="right") - 1
-            place = bad_points[0] - lines.offsets[owner]
+        entries = np.flatnonzero(~np.isfinite(lines.points).all(1))
+        if len(entries):
+            owner = np.searchsorted(lines.offsets, entries[0], side="right") - 1
+            index = entries[0] - lines.offsets[owner]
             raise DataError(
-                f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {place}): "
+                f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {index}): "
                 "correct it or leave the feature out"
             )
 
     def check_precision(self) -> None:
-        """Check that float32 resolves every position to a centimeter, as it does up to 131 km from the origin.
+        """Check that float32 resolves every position to a centimeter, which holds up to 131 km from the origin.
 
         Raises:
-            DataError: A position lies farther out, as in UTM coordinates; the message names track, step, place and
-                what float32 resolves.
+            DataError: A position lies farther out, as in UTM coordinates; the message names track, step, position
+                and the gap of float32.
         """
         tracks = self.tracks
         with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
             spacing = np.spacing(np.abs(tracks.position)).max(-1)  # [O, S] distance to the next float32
-        bad = np.argwhere(tracks.valid & (spacing > COARSEST_M))
+        entries = np.argwhere(tracks.valid & (spacing > COARSEST_M))
         way_out = "subtract an origin near it, in whole meters, from x and y of tracks, map and lights"
-        if len(bad):
-            track, step = bad[0]
+        if len(entries):
+            track, step = entries[0]
             x, y, z = tracks.position[track, step].tolist()
             raise DataError(
                 f"track {tracks.object_id[track]} is at ({x:.0f}, {y:.0f}, {z:.0f}) m at step {step}, where float32 "
@@ -374,12 +421,12 @@ class Scenario:
     def evaluated_indices(self) -> Int64[np.ndarray, "E"]:
         """Evaluated tracks: the ego and the tracks to predict, by ascending object id as in the official evaluator.
 
-        A track to predict that is not valid at the current step is left out, because it is not simulated.
+        A track to predict that is not valid at the current step is left out, because only valid agents are simulated.
         """
         # each track once, even where the ego is among the tracks to predict
-        chosen = np.unique(np.append(self.tracks_to_predict, self.ego_index).astype(np.int64))
-        chosen = chosen[self.tracks.valid[chosen, CURRENT_STEP]]
-        return chosen[np.argsort(self.tracks.object_id[chosen], kind="stable")]
+        indices = np.unique(np.append(self.tracks_to_predict, self.ego_index).astype(np.int64))
+        indices = indices[self.tracks.valid[indices, CURRENT_STEP]]
+        return indices[np.argsort(self.tracks.object_id[indices], kind="stable")]
 
     @cached_property
     def origin(self) -> Float[np.ndarray, "2"]:
@@ -389,9 +436,9 @@ class Scenario:
     def __repr__(self) -> str:
         types = self.tracks.object_type[self.simulated_indices]
         counts = [(int((types == t).sum()), t.name.lower()) for t in ObjectType]
-        kinds = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for count, kind in counts if count)
+        counts_text = ", ".join(f"{count} {name}{'s' if count != 1 else ''}" for count, name in counts if count)
         return (
-            f"Scenario({self.scenario_id!r}, {len(types)} agents ({kinds or 'none'}), {self.num_steps} steps, "
+            f"Scenario({self.scenario_id!r}, {len(types)} agents ({counts_text or 'none'}), {self.num_steps} steps, "
             f"{len(self.map_features)} map features)"
         )
 
@@ -402,51 +449,53 @@ class Scenario:
 _HTML_RENDERERS: dict[type, Callable[[Any], str | None]] = {}
 
 
-def register_html(shown: type, render: Callable[[Any], str | None]) -> None:
-    """Choose how a notebook shows values of a class. The viewer registers itself when it is imported.
+def register_html(displayed_type: type, render: Callable[[Any], str | None]) -> None:
+    """Choose how a notebook shows values of a class. The viewer registers a renderer on import.
 
     Args:
-        shown: Class whose `_repr_html_` calls `render_html`.
+        displayed_type: Class whose `_repr_html_` calls `render_html`.
         render: Function from a value to a text in HTML; None = the notebook prints the value.
     """
-    _HTML_RENDERERS[shown] = render
+    _HTML_RENDERERS[displayed_type] = render
 
 
 def render_html(value: Any) -> str | None:
-    """Text in HTML that a notebook shows for a value; None where nothing was registered for its class."""
+    """Text in HTML that a notebook shows for a value; None for a class without a registered renderer."""
     render = _HTML_RENDERERS.get(type(value))
     return None if render is None else render(value)
 
 
-def _check_shapes(part: Any, place: str) -> None:
+def _check_shapes(table: Any, name: str) -> None:
     sizes: dict[str, int] = {}
-    for one in fields(part):
-        value, is_optional = getattr(part, one.name), type(None) in get_args(one.type)
-        declared: Any = get_args(one.type)[0] if is_optional else one.type
+    for column in fields(table):
+        value, is_optional = getattr(table, column.name), type(None) in get_args(column.type)
+        declared: Any = get_args(column.type)[0] if is_optional else column.type
         if not hasattr(declared, "dim_str") or (value is None and is_optional):
             continue
         axes = declared.dim_str.split()
-        shown = f"[{', '.join(axes)}]"
+        declared_shape = f"[{', '.join(axes)}]"
         if not isinstance(value, np.ndarray):
-            raise DataError(f"{place}.{one.name} is {type(value).__name__}, it must be an array {shown}")
-        wanted = []
+            raise DataError(f"{name}.{column.name} is {type(value).__name__}, it must be an array {declared_shape}")
+        expected = []
         for axis, length in zip(axes, value.shape):
-            name, _, more = axis.partition("+")  # such as "F+1"
-            extra = int(more or 0)
-            wanted.append(int(axis) if axis.isdigit() else sizes.setdefault(name, length - extra) + extra)
-        if value.shape != tuple(wanted) or len(axes) != value.ndim:
-            known = ", ".join(f"{name} = {size}" for name, size in sizes.items())
-            raise DataError(f"{place}.{one.name} has the shape {value.shape}, it must be {shown}: {known}")
+            symbol, _, summand = axis.partition("+")  # such as "F+1"
+            extra = int(summand or 0)
+            expected.append(int(axis) if axis.isdigit() else sizes.setdefault(symbol, length - extra) + extra)
+        if value.shape != tuple(expected) or len(axes) != value.ndim:
+            lengths = ", ".join(f"{symbol} = {size}" for symbol, size in sizes.items())
+            raise DataError(f"{name}.{column.name} has the shape {value.shape}, it must be {declared_shape}: {lengths}")
 
 
-def _check_time_base(timestamps_s: Float[np.ndarray, "t"], num_steps: int) -> None:
-    """Refuse timestamps that are not 0.1 s apart: speeds, tokens and scores would be wrong by a factor."""
+def _check_time_base(timestamps_s: Any, num_steps: int) -> None:
+    """Check that timestamps are 0.1 s apart: else speeds, tokens and scores would be wrong by a factor."""
+    if np.ndim(timestamps_s) != 1:
+        raise DataError(f"timestamps are {in_short(timestamps_s)}, not one number for each step")
     if len(timestamps_s) != num_steps:
         raise DataError(f"{len(timestamps_s)} timestamps for {num_steps} steps")
     offset_s = timestamps_s - timestamps_s[0]
-    wrong = np.flatnonzero(~(np.abs(offset_s - STEP_S * np.arange(num_steps)) <= TIME_TOLERANCE_S))  # NaN, too
-    if len(wrong):
-        step = wrong[0]
+    steps = np.flatnonzero(~(np.abs(offset_s - STEP_S * np.arange(num_steps)) <= TIME_TOLERANCE_S))  # NaN, too
+    if len(steps):
+        step = steps[0]
         raise DataError(
             f"step {step} is {offset_s[step]:.3f} s after step 0 instead of {STEP_S * step:.1f} s: steps must be "
             f"{STEP_S:g} s apart, so resample the log to 10 Hz or correct its timestamps"
@@ -460,17 +509,17 @@ def _check_unique(complaint: str, ids: Int[np.ndarray, "n"]) -> None:
 
 
 def _check_types(
-    thing: str, ids: Int64[np.ndarray, "n"], field_name: str, codes: Int8[np.ndarray, "n"], kinds: type[IntEnum]
+    label: str, ids: Int64[np.ndarray, "n"], field_name: str, codes: Int8[np.ndarray, "n"], enumeration: type[IntEnum]
 ) -> None:
-    wrong = np.flatnonzero(~np.isin(codes, list(kinds)))
-    if len(wrong):
-        known = ", ".join(f"{kind.value} {kind.name.lower()}" for kind in kinds)
-        raise DataError(f"{thing} {ids[wrong[0]]}: {field_name} {codes[wrong[0]]} is none of {known}")
+    rows = np.flatnonzero(~np.isin(codes, list(enumeration)))
+    if len(rows):
+        choices = ", ".join(f"{member.value} {member.name.lower()}" for member in enumeration)
+        raise DataError(f"{label} {ids[rows[0]]}: {field_name} {codes[rows[0]]} is none of {choices}")
 
 
 @runtime_checkable
 class Scenarios(Protocol):
-    """Scenarios by position: a list of them, or a data set."""
+    """Scenarios by position: a list or a data set."""
 
     def __len__(self) -> int:
         """Number of scenarios."""
@@ -483,6 +532,6 @@ class Scenarios(Protocol):
 
 def list_scenario_ids(scenarios: Scenarios) -> Iterable[str]:
     """Scenario ids in order."""
-    # a data set has them in its index: its scenarios need not be read
-    known = getattr(scenarios, "scenario_ids", None)
-    return known if known is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))
+    # a data set has the ids in the index: no scenario is read
+    scenario_ids = getattr(scenarios, "scenario_ids", None)
+    return scenario_ids if scenario_ids is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))

@@ -1,7 +1,7 @@
 """Waymo Open Motion Dataset: TFRecord files of `Scenario` messages to `Scenario` objects, without TensorFlow.
 
-World coordinates become float32 here and nowhere else, because the official evaluator rounds them before it does
-anything. Values of states that are not valid are kept.
+World coordinates become float32 here alone, because the official evaluator rounds them first. Values of states that are
+not valid are kept.
 """
 
 import glob
@@ -28,26 +28,31 @@ from rlftsim.scenario.types import (
     MapFeatureType,
     Scenario,
     Tracks,
+    to_float32,
 )
 
 _TFRECORD_NAME = re.compile(r"\.tfrecords?(-\d+-of-\d+)?$")
-_LEFT, _RIGHT = 0, 1
+_FIRST_TYPES = {
+    "lane": MapFeatureType.LANE_UNDEFINED,
+    "road_line": MapFeatureType.LINE_UNKNOWN,
+    "road_edge": MapFeatureType.EDGE_UNKNOWN,
+}
+"""Feature type that WOMD's own number 0 of a member stands for."""
 _STATE_FIELDS = (
     *("center_x", "center_y", "center_z", "length", "width", "height"),
     *("heading", "velocity_x", "velocity_y", "valid"),
 )
-_POLYGONS = ("crosswalk", "speed_bump", "driveway")
 
 
 def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
     """Files of a source, sorted by path.
 
     Args:
-        source: a file of any name, a folder (searched with its subfolders for names like `x.tfrecord` and
+        source: File of any name, a folder (searched with subfolders for names like `x.tfrecord` and
             `training.tfrecord-00000-of-01000`), or a glob (`**` = any subfolders).
 
     Raises:
-        DataError: there is no such file, or none in the folder.
+        DataError: No such file, or no tfrecord file in the folder.
     """
     path = Path(source)
     if path.is_file():
@@ -67,40 +72,21 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
 
 
 def read_scenarios(
-    source: str | os.PathLike[str],
-    on_error: OnError = "stop",
-    *,
-    report: Callable[[SkippedRecord], None] = log_skipped,
+    source: str | os.PathLike[str], on_error: OnError = "stop", *, report: Callable[[SkippedRecord], None] = log_skipped
 ) -> Iterator[Scenario]:
     """Read the scenarios of tfrecord files, in the order of paths and records.
 
     Args:
-        source: file, folder or glob, as in `find_tfrecords`.
-        on_error: "stop" raises at the first bad file or record, "skip" reports it and goes on.
-        report: called with each skipped record, only under "skip".
+        source: File, folder or glob, as in `find_tfrecords`.
+        on_error: "stop" raises at the first bad file or record, "skip" reports the damage and goes on.
+        report: Function called with each skipped record, only under "skip".
 
     Raises:
-        DataError: no such file; under "stop" also any bad record: names file, record and cause.
+        DataError: No such file; under "stop" also a bad record: the message names file, record and cause.
     """
     for path in find_tfrecords(source):
-        for _, scenario in read_scenario_file(path, on_error=on_error, report=report):
+        for _, scenario in read_unit(WomdSource(), Unit(str(path), (path,)), on_error=on_error, report=report):
             yield scenario
-
-
-def read_scenario_file(
-    path: str | os.PathLike[str], *, on_error: OnError = "stop", report: Callable[[SkippedRecord], None] = log_skipped
-) -> Iterator[tuple[int, Scenario]]:
-    """Read one tfrecord file; yields the number of the record, from 0, with its scenario.
-
-    Args:
-        path: the file.
-        on_error: "stop" raises at the first bad record, "skip" reports it and goes on.
-        report: called with each skipped record, only under "skip".
-
-    Raises:
-        DataError: no such file; under "stop" also any bad record: names file, record and cause.
-    """
-    return read_unit(WomdSource(), Unit(str(path), (Path(path),)), on_error=on_error, report=report)
 
 
 class WomdSource:
@@ -112,18 +98,18 @@ class WomdSource:
     )
 
     def detects(self, path: str | os.PathLike[str]) -> bool:
-        """True where at least one file has the name of a tfrecord."""
+        """True where at least 1 file has the name of a tfrecord."""
         try:
             return any(_TFRECORD_NAME.search(file.name) for file in find_tfrecords(path))
         except DataError:
             return False
 
     def find(self, path: str | os.PathLike[str]) -> list[Unit]:
-        """One unit per tfrecord file, as in `find_tfrecords`."""
+        """A unit per tfrecord file, as in `find_tfrecords`."""
         return units_of_files(find_tfrecords(path))
 
     def read(self, unit: Unit) -> Iterator[Item]:
-        """The records of a tfrecord file in order, those that are damaged or no scenarios with their cause."""
+        """Records of a tfrecord file in order, and the cause for each that is damaged or no scenario."""
         (path,) = unit.files
         damaged: list[SkippedRecord] = []
         for record, data in read_records(path, on_error="skip", report=damaged.append):
@@ -138,18 +124,18 @@ class WomdSource:
         yield from damaged
 
     def describe(self) -> dict[str, object]:
-        """Nothing: no value of a record is guessed."""
+        """Empty: no value of a record is guessed."""
         return {}
 
 
 def scenario_from_bytes(record: bytes) -> Scenario:
-    """Scenario of one serialized WOMD `Scenario` message with 91 steps, or 11 as in the test splits.
+    """Scenario of a serialized WOMD `Scenario` message with 91 steps, or 11 as in the test splits.
 
-    Map, lights, tracks to predict and objects of interest may be missing. Map features of a kind that WOMD did not
-    have when this was written are left out.
+    Map, lights, tracks to predict and objects of interest may be missing. Map features of types newer than
+    womd.proto are left out.
 
     Raises:
-        DataError: the bytes are no such message; there is no ego or it is not valid at step 10; a valid state or a map
+        DataError: The bytes are no such message; the ego is missing or not valid at step 10; a valid state or a map
             point is not finite; the number of steps is another one; a track to predict does not exist; an object id
             occurs twice; a type is unknown; a size at step 10 is not above zero.
     """
@@ -192,6 +178,7 @@ def scenario_from_bytes(record: bytes) -> Scenario:
     )
     scenario.check_consistency()
     scenario.check_finite_arrays()
+    scenario.check_precision()
     return scenario
 
 
@@ -208,11 +195,11 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
             "take WOMD's 9-second files, not the 20-second ones"
         )
     # one tuple per state, made in C: filling arrays field by field costs several times as much
-    numbers_of = attrgetter(*_STATE_FIELDS)
-    rows = [numbers_of(state) for track in message.tracks for state in track.states]
+    read_state = attrgetter(*_STATE_FIELDS)
+    rows = [read_state(state) for track in message.tracks for state in track.states]
     # float64 holds all fields exactly, `valid` as 0 or 1
     states = np.array(rows).reshape(len(message.tracks), num_steps, -1)  # [O, S, 10] float64
-    values = _to_float32(states)
+    values = to_float32(states)
     return Tracks(
         object_id=np.array([track.id for track in message.tracks], np.int64),
         object_type=np.array([track.object_type for track in message.tracks], np.int8),
@@ -224,105 +211,64 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
     )
 
 
-def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Nearest float32. Values outside its range become infinite without a warning and are refused later."""
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
-
-
 def _read_lights(dynamic_states: Sequence[womd_pb2.DynamicMapState]) -> LightStates:
-    """All light states; the number of a `DynamicMapState` is its step."""
+    """All light states; the number of a `DynamicMapState` is the step."""
     # a few thousand rows at most, so a list is fast enough
     rows = [
         (step, light.lane, light.state, light.stop_point.x, light.stop_point.y, light.stop_point.z)
         for step, states in enumerate(dynamic_states)
         for light in states.lane_states
     ]
-    step, lane, state, *point = zip(*rows) if rows else ((),) * 6
-    return LightStates(
-        step=np.array(step, np.int32),
-        lane_id=np.array(lane, np.int64),
-        state=np.array(state, np.int8),
-        stop_point=_to_float32(np.array(point, np.float64).T.reshape(-1, 3)),
-    )
+    return LightStates.of(rows)
 
 
 def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     """Map features in the order of the message, those of unknown kinds left out."""
-    # a kind that womd.proto does not have yet reads as a feature without data
+    # a feature type that womd.proto does not have yet reads as a feature without data
     features = [feature for feature in features if feature.WhichOneof("feature_data")]
-    kinds = [feature.WhichOneof("feature_data") for feature in features]
-    typed_points = [_parse_points(feature, kind) for feature, kind in zip(features, kinds)]
-    flat = [value for _, points in typed_points for p in points for value in (p.x, p.y, p.z)]
-    offsets = np.zeros(len(features) + 1, np.int64)
-    np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
-    doubles = np.array(flat, np.float64).reshape(-1, 3)  # [P, 3]
-    points = _to_float32(doubles)
-    # The rounding error of polygons. Only of finite points: infinity minus infinity would warn before the point is
-    # refused by name.
-    is_polygon = np.repeat(np.array([kind in _POLYGONS for kind in kinds], bool), np.diff(offsets))  # [P]
-    rest = np.zeros_like(doubles)
-    np.subtract(doubles, points, out=rest, where=is_polygon[:, None] & np.isfinite(points))
-    return MapFeatures(
-        feature_id=np.array([feature.id for feature in features], np.int64),
-        feature_type=np.array([kind for kind, _ in typed_points], np.int8),
-        points=points,
-        offsets=offsets,
-        topology=_read_topology(features, kinds),
-        polygon_rest=_to_float32(rest),
-    )
+    members = [feature.WhichOneof("feature_data") for feature in features]
+    rows = []
+    for feature, member in zip(features, members):
+        feature_type, points = _read_points(feature, member)
+        rows.append((feature.id, feature_type, np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)))
+    return MapFeatures.of(rows, _read_topology(features, members), has_polygon_rest=True)
 
 
-def _parse_points(feature: womd_pb2.MapFeature, kind: str) -> tuple[int, Sequence[womd_pb2.MapPoint]]:
-    """Type of a map feature (numbers of `MapFeatureType`) and its points."""
-    match kind:
-        case "lane":
-            return feature.lane.type, feature.lane.polyline
-        case "road_line":
-            return MapFeatureType.LINE_UNKNOWN + feature.road_line.type, feature.road_line.polyline
-        case "road_edge":
-            return MapFeatureType.EDGE_UNKNOWN + feature.road_edge.type, feature.road_edge.polyline
-        case "stop_sign":
-            return MapFeatureType.STOP_SIGN, [feature.stop_sign.position]
-        case "crosswalk":
-            return MapFeatureType.CROSSWALK, feature.crosswalk.polygon
-        case "speed_bump":
-            return MapFeatureType.SPEED_BUMP, feature.speed_bump.polygon
-        case "driveway":
-            return MapFeatureType.DRIVEWAY, feature.driveway.polygon
-    raise AssertionError(f"womd.proto has a kind of map feature that is not read: {kind}")
+def _read_points(feature: womd_pb2.MapFeature, member: str) -> tuple[int, Sequence[womd_pb2.MapPoint]]:
+    """Type of a map feature (numbers of `MapFeatureType`) and the points."""
+    data = getattr(feature, member)
+    if member == "stop_sign":
+        return MapFeatureType.STOP_SIGN, [data.position]
+    if member in _FIRST_TYPES:
+        return _FIRST_TYPES[member] + data.type, data.polyline
+    return MapFeatureType[member.upper()], data.polygon  # crosswalk, speed bump or driveway
 
 
-def _read_topology(features: Sequence[womd_pb2.MapFeature], kinds: Sequence[str]) -> LaneTopology:
+def _read_topology(features: Sequence[womd_pb2.MapFeature], members: Sequence[str]) -> LaneTopology:
     """Links of all lanes as tables, the first column the lane's feature id."""
-    lanes = [(feature.id, feature.lane) for feature, kind in zip(features, kinds) if kind == "lane"]
-    is_lane = np.array([kind == "lane" for kind in kinds], bool)
+    lanes = [(feature.id, feature.lane) for feature, member in zip(features, members) if member == "lane"]
+    is_lane = np.array([member == "lane" for member in members], bool)
     speed_limit = np.zeros(len(features), np.float32)
     interpolating = np.zeros(len(features), bool)
-    speed_limit[is_lane] = _to_float32(np.array([lane.speed_limit_mph for _, lane in lanes], np.float64))
+    speed_limit[is_lane] = to_float32(np.array([lane.speed_limit_mph for _, lane in lanes], np.float64))
     interpolating[is_lane] = [lane.interpolating for _, lane in lanes]
     neighbors, boundaries = [], []
     for lane_id, lane in lanes:
-        for side, found in ((_LEFT, lane.left_neighbors), (_RIGHT, lane.right_neighbors)):
-            for n in found:
-                own, other = (n.self_start_index, n.self_end_index), (n.neighbor_start_index, n.neighbor_end_index)
-                neighbors.append((lane_id, side, n.feature_id, *own, *other))
-        for side, found in ((_LEFT, lane.left_boundaries), (_RIGHT, lane.right_boundaries)):
-            for b in found:
+        for side, links in enumerate((lane.left_neighbors, lane.right_neighbors)):
+            for n in links:
+                spans = (n.self_start_index, n.self_end_index, n.neighbor_start_index, n.neighbor_end_index)
+                neighbors.append((lane_id, side, n.feature_id, *spans))
+        for side, links in enumerate((lane.left_boundaries, lane.right_boundaries)):
+            for b in links:
                 span = (b.lane_start_index, b.lane_end_index)
                 boundaries.append((lane_id, side, b.boundary_feature_id, *span, b.boundary_type))
-    return LaneTopology(
-        entry_lanes=_rows(2, [(lane_id, other) for lane_id, lane in lanes for other in lane.entry_lanes]),
-        exit_lanes=_rows(2, [(lane_id, other) for lane_id, lane in lanes for other in lane.exit_lanes]),
-        neighbors=_rows(7, neighbors),
-        boundaries=_rows(6, boundaries),
-        stop_sign_lanes=_rows(
-            2, [(f.id, lane) for f, kind in zip(features, kinds) if kind == "stop_sign" for lane in f.stop_sign.lane]
-        ),
+    signs = [feature for feature, member in zip(features, members) if member == "stop_sign"]
+    return LaneTopology.of(
+        entry_lanes=[(lane_id, link) for lane_id, lane in lanes for link in lane.entry_lanes],
+        exit_lanes=[(lane_id, link) for lane_id, lane in lanes for link in lane.exit_lanes],
+        neighbors=neighbors,
+        boundaries=boundaries,
+        stop_sign_lanes=[(sign.id, lane_id) for sign in signs for lane_id in sign.stop_sign.lane],
         speed_limit_mph=speed_limit,
         interpolating=interpolating,
     )
-
-
-def _rows(columns: int, rows: list[tuple[int, ...]]) -> np.ndarray:
-    return np.array(rows, np.int64).reshape(-1, columns)

@@ -1,1 +1,1 @@
-"""Entries of the Sim Agents challenge: archives that are built resumably and checked before they are uploaded."""
+"""Entries of the Sim Agents challenge: archives that are built resumably and checked before the upload."""

@@ -1,9 +1,9 @@
 """Archives for the Sim Agents challenge: simulate a split shard by shard, pack, check.
 
-    OUT/plan.json                what the shards depend on; another plan is refused
+    OUT/plan.json                all that the shards depend on; any other plan is refused
     OUT/shards/00003.part        a finished shard, compressed (`submission.archive`)
-    OUT/shards/00003.json        its receipt, written after it
-    OUT/submission.tar.gz        appears when it is whole
+    OUT/shards/00003.json        receipt of the shard, written afterwards
+    OUT/submission.tar.gz        appears when complete
 
 A build that was interrupted in any way goes on with the shards that have no receipt. The bytes of the archive depend on
 the plan alone, not on processes or interruptions.
@@ -32,7 +32,7 @@ from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.items import ResultFormat, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import Runner, choose_runner
+from rlftsim.jobs.runner import Runner, choose_runner, select_items
 from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -47,7 +47,7 @@ _SHARDS, _LOCK = "shards", ".lock"
 
 @dataclass(frozen=True)
 class Job:
-    """Input of the work on a shard; is handed to other processes."""
+    """Input of the work on a shard; is handed to worker processes."""
 
     policy: Policy
     data: ScenarioDataset
@@ -67,7 +67,7 @@ class Job:
         return self.folder / _SHARDS / f"{number:05d}.json"
 
     def receipt(self, number: int) -> PackedShard | None:
-        """A finished shard; None if there is none. Its file may be in the archive already."""
+        """A finished shard, whose file may be in the archive already; None before that."""
         try:
             shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
             check_types(shard)
@@ -78,7 +78,7 @@ class Job:
 
 @dataclass(frozen=True)
 class _Receipts(ResultFormat[int, PackedShard]):
-    """Finished shards by number, as their receipts tell; the first ones may be in the unfinished archive alone."""
+    """Finished shards by number, from the receipts; the first shards may be in the unfinished archive alone."""
 
     job: Job
     num_joined: int
@@ -101,21 +101,21 @@ class _Receipts(ResultFormat[int, PackedShard]):
 
 
 def build_archive(
-    job: Job, *, runner: Runner | None = None, delete_parts: bool = False, show_progress: bool = True
+    job: Job, *, runner: Runner | None = None, is_deleting: bool = False, show_progress: bool = True
 ) -> Path:
-    """Simulate what is missing, write the archive and return its path. Interrupted in any way, the same call goes on.
+    """Simulate the missing shards, write the archive and return the path. After an interruption the same call goes on.
 
     Args:
         job: Policy, data, plan and settings of the submission.
         runner: Runner of the work in place of the settings' processes, see `rlftsim.jobs.runner`.
-        delete_parts: True removes each compressed shard as soon as it is in the archive, which halves the disk space.
+        is_deleting: True removes each compressed shard as soon as the archive holds the bytes: half the disk space.
         show_progress: False prints neither progress nor the time left.
 
     Raises:
         ConfigError: Several processes for a policy on a GPU, or a folder with work on another plan.
         DataError: Rollouts that the server would refuse, a disk that is full, or another driver at work here.
-        SetAside: Shards that killed their process again and again; all others are done.
-        Unfinished: `runner` is a share, which is done, while others are not.
+        SetAside: Shards that killed a process again and again; all remaining shards are done.
+        Unfinished: `runner` is a share, which is done, while the remaining shares are not.
     """
     check_folder(job.folder, "submission")
     check_jobs(job.config.jobs, get_device(job.policy))
@@ -135,26 +135,26 @@ def build_archive(
         if lease.is_alone:
             remove_temporaries_below(shards)
         receipts = _Receipts(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
-        _forecast(job, sum(not receipts.is_finished(n) for n in runner.select(numbers)))
+        _forecast(job, sum(not receipts.is_finished(n) for n in select_items(runner, numbers)))
         packed_shards = run_items(
             "submit", numbers, partial(_build_shard, job),
             format=receipts, lease=lease, runner=runner, show_progress=show_progress,
         )  # fmt: skip
         remove_temporaries_below(shards)
         remove_temporaries(job.folder / PLAN)
-        join_shards(archive, shards, packed_shards, delete=delete_parts)
+        join_shards(archive, shards, packed_shards, delete=is_deleting)
         lease.remove()
     return archive
 
 
-def delete_parts(job: Job) -> None:
+def delete_shards(job: Job) -> None:
     """Remove the compressed shards of a finished archive, and the receipts."""
     paths = [path for n in range(len(job.plan.shards)) for path in (job.shard_path(n), job.receipt_path(n))]
     remove_folder(job.folder / _SHARDS, [path.name for path in paths])
 
 
 def _forecast(job: Job, num_missing: int) -> None:
-    """Log how large the archive will be, and whether the disk has too little room."""
+    """Log the size of the archive to come, and warn of a disk with too little room."""
     low, high = (ratio * job.plan.message_bytes / 1e9 for ratio in GZIP_RATIO)
     free = shutil.disk_usage(job.folder).free / 1e9
     log.info(
@@ -186,15 +186,13 @@ def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[
     is_first = not any(job.receipt_path(n).exists() for n in range(len(job.plan.shards)))
     write_text(job.receipt_path(number), json.dumps(asdict(shard)) + "\n")
     if is_first:
-        size = forecast_size(job.plan, number, shard)
-        log.info(
-            f"  first shard: compressed to {shard.size / shard.raw_size:.3f}, so the archive will have "
-            f"about {size / 1e9:.3g} GB."
-        )
+        size_gb = forecast_size(job.plan, number, shard) / 1e9
+        ratio = shard.size / shard.raw_size
+        log.info(f"  first shard: compressed to {ratio:.3f}, so the archive will have about {size_gb:.3g} GB.")
 
 
 def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
-    """Rollouts of a scenario as the archive holds them, checked."""
+    """Serialized rollouts of a scenario for the archive, checked."""
     states = simulate_states(job.policy, scenario, job.config, get_device(job.policy))
     message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
     for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
@@ -204,11 +202,11 @@ def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
 
 
 def forecast_size(plan: Plan, number: int, shard: PackedShard) -> float:
-    """Bytes that the archive will have, from one finished shard.
+    """Bytes that the archive will have, extrapolated from a finished shard.
 
     Args:
         plan: Plan of the archive, with the number of agents in each shard.
         number: Number of the finished shard in the plan.
-        shard: The finished shard, whose size stands for those of the others.
+        shard: The finished shard, whose size per agent stands for all shards.
     """
     return shard.size / plan.num_agents[number] * sum(plan.num_agents)

@@ -1,4 +1,4 @@
-"""Checks of a finished archive, in one pass from its first to its last byte."""
+"""Checks of a finished archive, in a single pass from the first to the last byte."""
 
 import hashlib
 import io
@@ -21,7 +21,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import GzipReader
 from rlftsim.submission.entry import find_problems
-from rlftsim.submission.findings import MAX_KEPT, Finding, Findings
+from rlftsim.submission.findings import MAX_STORED, Finding, Findings, Severity
 from rlftsim.submission.messages import DecodedRollouts, decode_rollouts
 from rlftsim.submission.scenario_checks import check_rollouts
 
@@ -38,7 +38,7 @@ MAX_OTHER_AGENTS = 0.01
 MIN_OTHER_AGENTS = 10
 _TAR_BUFFER = 1 << 20
 
-SeeRollouts = Callable[[Scenario, DecodedRollouts], None]
+RolloutsCallback = Callable[[Scenario, DecodedRollouts], None]
 
 
 @dataclass
@@ -54,7 +54,7 @@ class ArchiveCheck:
     num_trajectories: int = 0
     num_jumps: int = 0
     raw_bytes: int = 0
-    """Of the shards."""
+    """Uncompressed bytes of the shards."""
     shards: list[str] = field(default_factory=list)
     """Names, in the order of the archive."""
     metadata: SimAgentsChallengeSubmission | None = None
@@ -68,22 +68,24 @@ def check_archive(
     *,
     sample: float = 1.0,
     expected_sha256: str | None = None,
-    see: SeeRollouts | None = None,
+    callback: RolloutsCallback | None = None,
     show_progress: bool = True,
 ) -> ArchiveCheck:
-    """Read an archive front to back and make every check of `findings.CHECKS`; memory of one scenario.
+    """Contents and findings of an archive that is read front to back with every check of `findings.CHECKS`.
+
+    Memory holds a single scenario at a time.
 
     Args:
-        archive: a .tar.gz, from any writer.
-        data: scenarios of the split that the archive is for; None makes only the checks that need none.
-        sample: fraction of the scenarios whose trajectories are looked at; names, fields and sets are checked for all.
-        expected_sha256: of the file that was built; None = not known.
-        see: called with each scenario whose trajectories have no error, and its rollouts.
-        show_progress: False = no progress bar.
+        archive: A .tar.gz, from any writer.
+        data: Scenarios of the split that the archive is for; None makes only the checks that need no data set.
+        sample: Fraction of scenarios with a look at the trajectories; names, fields and sets are always checked.
+        expected_sha256: Checksum of the file that was built; None = not compared.
+        callback: Function of a scenario and the rollouts, called for trajectories without an error.
+        show_progress: False shows no progress bar.
 
     Raises:
-        ConfigError: a sample of nothing.
-        DataError: no such file, a folder, or a damaged data set.
+        ConfigError: A sample of nothing.
+        DataError: A missing file, a folder, or a damaged data set.
     """
     if not 0 < sample <= 1:
         raise ConfigError(f"sample={sample:g} must be above 0 and at most 1.")
@@ -92,44 +94,42 @@ def check_archive(
         raise DataError(f"{archive} is a folder: name the .tar.gz in it.")
     if not archive.is_file():
         raise DataError(f"{archive}: there is no such archive.")
-    found = ArchiveCheck(archive.name, archive.stat().st_size)
+    check = ArchiveCheck(archive.name, archive.stat().st_size)
+    archive_pass = _Pass(check, data, sample, callback)
     if SPLIT_NAME.fullmatch(archive.name):
-        whole = archive.name.rpartition(".")[0]
-        text = f"a part of an archive: join the parts first, cat {whole}.??? > {whole}"
-        found.findings.add(Finding(17, "error", text, archive.name))
-        return found
-    pass_over = _Pass(found, data, sample, see)
-    with archive.open("rb") as file, progress_bar("check", found.size, unit="bytes", show=show_progress) as advance:
+        joined = archive.name.rpartition(".")[0]
+        archive_pass.add(17, f"a part of an archive: join the parts first, cat {joined}.??? > {joined}")
+        return check
+    with archive.open("rb") as file, progress_bar("check", check.size, unit="bytes", show=show_progress) as advance:
         reader = GzipReader(file)
-        is_whole = pass_over.read(reader, file, advance)
+        is_complete = archive_pass.read(reader, file, advance)
         reader.read_to_end()  # what follows damage still counts for the checksum
-    found.sha256 = reader.sha256
-    pass_over.judge(is_whole)
-    if expected_sha256 is not None and found.sha256 != expected_sha256:
-        text = "not the file that its report describes (SHA-256 differs): copied in part, or replaced"
-        found.findings.add(Finding(17, "error", text, archive.name))
-    return found
+    check.sha256 = reader.sha256
+    archive_pass.judge(is_complete)
+    if expected_sha256 not in (None, check.sha256):
+        archive_pass.add(17, "not the file that its report describes (SHA-256 differs): copied in part, or replaced")
+    return check
 
 
 @dataclass(eq=False)
 class _Pass:
-    """State of one pass over an archive."""
+    """State of a pass over an archive."""
 
-    found: ArchiveCheck
+    check: ArchiveCheck
     data: ScenarioDataset | None
     sample: float
-    see: SeeRollouts | None
-    seen: set[str] = field(default_factory=set)
+    callback: RolloutsCallback | None
+    scenario_ids: set[str] = field(default_factory=set)
     numbers: list[tuple[int, int]] = field(default_factory=list)
     """Number and count in the names of shards."""
-    whole_data: ScenarioDataset | None = None
-    """All splits; opened where a scenario is not of the split."""
-    of_data: DataError | None = None
+    all_splits: ScenarioDataset | None = None
+    """The data set without a split; opened where a scenario is not of the split."""
+    data_error: DataError | None = None
     """Damage of the data set, which says nothing about the archive."""
 
     def read(self, reader: GzipReader, file: BinaryIO, advance: Callable[[int], None]) -> bool:
         """Read all shards; False if the archive is damaged."""
-        done = 0
+        num_read = 0
         try:
             magic = file.read(2)
             file.seek(0)
@@ -139,139 +139,132 @@ class _Pass:
                 for member in tar:
                     contents = tar.extractfile(member)
                     self._read_shard(member, contents if isinstance(contents, io.BufferedReader) else None)
-                    advance(reader.packed_size - done)
-                    done = reader.packed_size
+                    advance(reader.packed_size - num_read)
+                    num_read = reader.packed_size
             reader.finish()
-            advance(reader.packed_size - done)
+            advance(reader.packed_size - num_read)
         except (DataError, tarfile.TarError) as error:
-            if error is self.of_data:
+            if error is self.data_error:
                 raise
-            self._add(7, str(error), self.found.archive)
+            self.add(7, str(error))
             return False
         return True
 
     def _read_shard(self, member: tarfile.TarInfo, contents: io.BufferedReader | None) -> None:
-        """Check the name of a file, its fields and its scenarios."""
+        """Check name, fields and scenarios of a file."""
         match = SHARD_NAME.fullmatch(member.name)
         if contents is None or match is None or "/" in member.name:
-            wanted = "wanted are flat names such as submission.binproto-00000-of-00150"
-            self._add(6, f"no shard's name; {wanted}", member.name)
+            text = "no shard's name; wanted are flat names such as submission.binproto-00000-of-00150"
+            self.add(6, text, member.name)
             if contents is None:
                 return
         elif match[1]:
             self.numbers.append((int(match[2]), int(match[3])))
         if member.size >= MAX_SHARD_BYTES:
-            self._add(16, f"{member.size / 1e9:.2f} GB; protobuf reads less than 2 GB: use more shards", member.name)
-        self.found.shards.append(member.name)
-        self.found.raw_bytes += member.size
-        rest = bytearray()
-        for whole in read_fields(contents, member.size):
-            if (whole.number, whole.wire_type) == (1, BYTES):
-                self._read_scenario(whole.payload, member.name)
+            self.add(16, f"{member.size / 1e9:.2f} GB; protobuf reads less than 2 GB: use more shards", member.name)
+        self.check.shards.append(member.name)
+        self.check.raw_bytes += member.size
+        metadata = bytearray()
+        for wire_field in read_fields(contents, member.size):
+            if (wire_field.number, wire_field.wire_type) == (1, BYTES):
+                self._read_scenario(wire_field.payload, member.name)
             else:
-                rest += whole.head + whole.payload
-                if len(rest) > MAX_METADATA_BYTES:
+                metadata += wire_field.head + wire_field.payload
+                if len(metadata) > MAX_METADATA_BYTES:
                     raise DataError(f"{member.name}: more than {MAX_METADATA_BYTES} bytes beside rollouts")
-        self._read_metadata(bytes(rest), member.name)
+        self._read_metadata(bytes(metadata), member.name)
 
     def _read_metadata(self, data: bytes, file: str) -> None:
         try:
             metadata = SimAgentsChallengeSubmission.FromString(data)
         except DecodeError as error:
             raise DataError(f"{file}: no submission message ({error})") from None
-        problems = find_problems(metadata)
-        if not problems and self.found.metadata is not None and metadata != self.found.metadata:
-            names = [
-                one.name
-                for one in metadata.DESCRIPTOR.fields
-                if getattr(metadata, one.name) != getattr(self.found.metadata, one.name)
-            ]
-            problems = [f"{', '.join(names)} differ from those of {self.found.shards[0]}"]
+        problems, first = find_problems(metadata), self.check.metadata
+        if not problems and first is not None and metadata != first:
+            names = [f.name for f in metadata.DESCRIPTOR.fields if getattr(metadata, f.name) != getattr(first, f.name)]
+            problems = [f"{', '.join(names)} differ from those of {self.check.shards[0]}"]
         if problems:
-            self._add(5, "; ".join(problems), file)
-        if self.found.metadata is None:
-            self.found.metadata = metadata
+            self.add(5, "; ".join(problems), file)
+        if first is None:
+            self.check.metadata = metadata
 
     def _read_scenario(self, data: bytes, file: str) -> None:
         decoded = decode_rollouts(data)
         name = decoded.scenario_id
-        self.found.num_scenarios += 1
-        if name in self.seen:
-            self._add(8, "the scenario is in the archive twice", file, name)
+        self.check.num_scenarios += 1
+        if name in self.scenario_ids:
+            self.add(8, "the scenario is in the archive twice", file, name)
             return
         if self.data is not None and name not in self.data:
             self._add_foreign(self.data, name, file)
             return
-        self.seen.add(name)
-        if self.data is None or (self.sample < 1 and _place(name) >= self.sample):
+        self.scenario_ids.add(name)
+        if self.data is None or (self.sample < 1 and _hash_fraction(name) >= self.sample):
             return
         try:
             scenario = self.data.by_id(name)
         except DataError as error:
-            self.of_data = error
+            self.data_error = error
             raise
-        checked = check_rollouts(decoded, scenario, file)
-        self.found.num_checked += 1
-        self.found.num_trajectories += checked.num_agents
-        self.found.num_jumps += checked.num_jumps
-        for finding in checked.findings:
-            self.found.findings.add(finding)
-        if self.see is not None and not any(finding.severity == "error" for finding in checked.findings):
-            self.see(scenario, decoded)
+        scenario_check = check_rollouts(decoded, scenario, file)
+        self.check.num_checked += 1
+        self.check.num_trajectories += scenario_check.num_agents
+        self.check.num_jumps += scenario_check.num_jumps
+        for finding in scenario_check.findings:
+            self.check.findings.add(finding)
+        if self.callback is not None and not any(f.severity == "error" for f in scenario_check.findings):
+            self.callback(scenario, decoded)
 
     def _add_foreign(self, data: ScenarioDataset, name: str, file: str) -> None:
-        """A scenario that is not of the split: of another one, or unknown."""
-        if self.whole_data is None:
-            self.whole_data = ScenarioDataset(data.folder)
-        if name in self.whole_data:
-            split = self.whole_data.index["split"][self.whole_data.scenario_ids.index(name)].as_py()
-            self._add(9, f"of split {split}, not {data.split}", file, name)
+        """Add the finding of a scenario that is not of the split: of another split, or unknown."""
+        if self.all_splits is None:
+            self.all_splits = ScenarioDataset(data.folder)
+        if name in self.all_splits:
+            split = self.all_splits.index["split"][self.all_splits.scenario_ids.index(name)].as_py()
+            self.add(9, f"of split {split}, not {data.split}", file, name)
         else:
-            self._add(2, f"unknown to {data.folder}, split {data.split}", file, name)
+            self.add(2, f"unknown to {data.folder}, split {data.split}", file, name)
 
-    def judge(self, is_whole: bool) -> None:
-        """Findings about the archive as a whole."""
-        found = self.found
-        if found.size >= DOUBTFUL_ARCHIVE_BYTES:
-            text = f"{found.size / 1e9:.0f} GB: the server has taken archives below 50 GB; try --round 0.001"
-            found.findings.add(Finding(16, "warning", text, found.archive))
-        if not is_whole:
+    def judge(self, is_complete: bool) -> None:
+        """Add the findings about the archive in total; `is_complete` is False where damage ended the reading."""
+        check = self.check
+        if check.size >= DOUBTFUL_ARCHIVE_BYTES:
+            text = f"{check.size / 1e9:.0f} GB: the server has taken archives below 50 GB; try --round 0.001"
+            self.add(16, text, severity="warning")
+        if not is_complete:
             return  # whatever is missing lies behind the damage
-        if not found.shards:
-            self._add(
-                6, "there is no shard in it: pack files named as submission.binproto-00000-of-00150", found.archive
-            )
+        if not check.shards:
+            self.add(6, "there is no shard in it: pack files named as submission.binproto-00000-of-00150")
         if self.numbers:
             total = self.numbers[0][1]
-            if Counter(number for number, _ in self.numbers) != Counter(range(total)) or any(
-                count != total for _, count in self.numbers
-            ):
-                text = f"{len(self.numbers)} shards whose names do not count from 0 to {total - 1} of {total}"
-                self._add(6, text, found.archive)
+            if Counter(self.numbers) != Counter((number, total) for number in range(total)):
+                self.add(6, f"{len(self.numbers)} shards whose names do not count from 0 to {total - 1} of {total}")
         if self.data is None:
             return
-        missing = [name for name in self.data.scenario_ids if name not in self.seen]
+        missing = [name for name in self.data.scenario_ids if name not in self.scenario_ids]
         if missing:
-            some = ", ".join(missing[:MAX_KEPT])
-            text = f"{len(missing)} of {len(self.data)} scenarios of split {self.data.split} missing: {some}"
-            self._add(2, text, found.archive)
-        if found.num_trajectories and found.num_jumps > MAX_JUMPS * found.num_trajectories:
-            percent = 100 * found.num_jumps / found.num_trajectories
+            names = ", ".join(missing[:MAX_STORED])
+            self.add(2, f"{len(missing)} of {len(self.data)} scenarios of split {self.data.split} missing: {names}")
+        if check.num_trajectories and check.num_jumps > MAX_JUMPS * check.num_trajectories:
+            percent = 100 * check.num_jumps / check.num_trajectories
             text = f"{percent:.3g} % of agents jump away from the log at the first step: another frame, or off by one"
-            found.findings.add(Finding(13, "warning", text, found.archive))
-        others = found.findings.counts[1]
-        if others >= max(MIN_OTHER_AGENTS, MAX_OTHER_AGENTS * found.num_checked):
-            first = found.findings.drop(1)[0]
+            self.add(13, text, severity="warning")
+        num_differing = check.findings.counts[1]
+        if num_differing >= max(MIN_OTHER_AGENTS, MAX_OTHER_AGENTS * check.num_checked):
+            first = check.findings.drop(1)[0]
             text = (
-                f"{others} of {found.num_checked} scenarios have other agents than {self.data.folder} "
+                f"{num_differing} of {check.num_checked} scenarios have other agents than {self.data.folder} "
                 f"({self.data.fingerprint[:8]}): simulated from another version of the data. First: {first}"
             )
-            self._add(15, text, found.archive)
+            self.add(15, text)
 
-    def _add(self, check: int, text: str, file: str, scenario_id: str | None = None) -> None:
-        self.found.findings.add(Finding(check, "error", text, file, scenario_id))
+    def add(
+        self, number: int, text: str, file: str = "", scenario_id: str | None = None, severity: Severity = "error"
+    ) -> None:
+        """Add a finding about a scenario or shard, or about the archive if `file` is left out."""
+        self.check.findings.add(Finding(number, severity, text, file or self.check.archive, scenario_id))
 
 
-def _place(scenario_id: str) -> float:
-    """A number in [0, 1) for each scenario, always the same."""
+def _hash_fraction(scenario_id: str) -> float:
+    """A number in [0, 1) for each scenario, the same in every check."""
     return int.from_bytes(hashlib.blake2b(scenario_id.encode(), digest_size=8).digest(), "little") / 2**64

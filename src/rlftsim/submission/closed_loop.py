@@ -1,4 +1,4 @@
-"""The challenge's rule about closed loop: the statement an entry makes, and policies that cannot make it."""
+"""The challenge's rule about closed loop: the statement of an entry, and a check of the policy."""
 
 import torch
 from torch import Tensor
@@ -17,19 +17,19 @@ MAX_STEPS_PER_DECISION = 10
 
 
 def statement(policy: Policy, sampling: Sampling) -> str:
-    """Statement that an entry makes with the closed-loop flag, as far as this code can vouch for it.
+    """Statement that an entry makes with the closed-loop flag, as far as this code can vouch for the policy.
 
     Args:
-        policy: that is simulated.
-        sampling: temperature and truncation.
+        policy: Policy whose rollouts are submitted; gives the seconds between decisions.
+        sampling: Temperature and truncation of the submitted rollouts, quoted in the statement.
     """
     stride = policy.steps_per_decision
-    truncated = "" if sampling.top_k is None else f", top {sampling.top_k}"
+    limit = "" if sampling.top_k is None else f", top {sampling.top_k}"
     return f"""The challenge takes outputs of "individual next-state prediction inference calls", each conditioned on
 the preceding states, made at least once a second. The ego's next state must be independent of the others'
 given the past. How these rollouts are made:
 * the policy decides every {stride * STEP_S:g} s, {FUTURE_STEPS // stride} times in 8 s, from the states so far;
-* every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{truncated});
+* every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{limit});
 * it sees the log up to the current step only: no future, no goals;
 * nothing drawn at the start of a rollout is shared by the ego and other agents;
 * every rollout that is drawn is submitted: none is selected, repaired or drawn again by its outcome.
@@ -38,15 +38,15 @@ for you to know."""
 
 
 def check_closed_loop(policy: Policy, scenario: Scenario) -> None:
-    """Refuse a policy that cannot make the statement.
+    """Check that a policy can make the statement.
 
     Args:
-        policy: to be simulated.
-        scenario: any, to try the policy on.
+        policy: Policy whose rollouts will be submitted.
+        scenario: Any scenario, to try the policy on.
 
     Raises:
-        ConfigError: it decides less than once a second, reads the logged future, or the ego's draws at the start of a
-            rollout depend on other agents' noise, or theirs on the ego's.
+        ConfigError: A policy that decides less than once a second, reads the logged future, or couples the draws of
+            ego and other agents at the start of a rollout.
     """
     stride = policy.steps_per_decision
     if stride > MAX_STEPS_PER_DECISION:
@@ -55,11 +55,11 @@ def check_closed_loop(policy: Policy, scenario: Scenario) -> None:
             "a second."
         )
     if scenario.has_future:  # in a test split there is none that could be read
-        with_it, without_it = (
-            simulate(policy, collate([one]).to(get_device(policy)), num_rollouts=1, seed=0).position
-            for one in (scenario, without_future(scenario))
+        informed, blind = (
+            simulate(policy, collate([variant]).to(get_device(policy)), num_rollouts=1, seed=0).position
+            for variant in (scenario, without_future(scenario))
         )
-        if not torch.allclose(with_it, without_it, rtol=0.0, atol=POSE_TOLERANCE_M):
+        if not torch.allclose(informed, blind, rtol=0.0, atol=POSE_TOLERANCE_M):
             raise ConfigError(
                 "the policy's rollouts change where the logged future is taken away: the challenge wants each state "
                 "to follow from the states before it. Let `encode` read no step behind the current one."
@@ -71,19 +71,18 @@ def check_closed_loop(policy: Policy, scenario: Scenario) -> None:
     is_ego = torch.from_numpy(scenario.simulated_indices == scenario.ego_index).to(batch.device)  # [A]
     with torch.no_grad():
         context = policy.encode(batch)
-        before, after = (
-            policy.begin(context, 1, None, given).draws
-            for given in (noise, torch.where(is_ego[:, None], 1 - noise, noise))
+        draws, ego_draws = (
+            policy.begin(context, 1, None, agent_noise).draws
+            for agent_noise in (noise, torch.where(is_ego[:, None], 1 - noise, noise))
         )
-    if before is not None and not _is_ego_alone(before, after, is_ego):
+    if draws is not None and not _is_ego_alone(draws, ego_draws, is_ego):
         raise ConfigError(
             "the policy draws something at the start of a rollout that the ego shares with other agents: the challenge "
             "wants the ego to be independent of them, because a planner will take its place."
         )
 
 
-def _is_ego_alone(before: Tensor, after: Tensor, is_ego: Tensor) -> bool:
-    """True if draws have an agent axis along which only the ego's changed."""
-    if before.dim() < 3 or before.shape[2] != len(is_ego):
-        return False
-    return bool((before[:, :, ~is_ego] == after[:, :, ~is_ego]).all())
+def _is_ego_alone(draws: Tensor, ego_draws: Tensor, is_ego: Tensor) -> bool:
+    """True if draws have an agent axis along which only the ego's differ."""
+    has_agents = draws.dim() >= 3 and draws.shape[2] == len(is_ego)
+    return has_agents and bool((draws[:, :, ~is_ego] == ego_draws[:, :, ~is_ego]).all())

@@ -21,16 +21,16 @@ REQUIRED_FIELDS = (
 _LISTS, _SWITCHES = ("authors", "public_models"), ("uses_lidar", "uses_camera", "uses_public_models")
 _EMAIL = re.compile(r"[^@\s]+@[^@\s.]+(\.[^@\s.]+)+")
 _PLACEHOLDERS = ("test", "todo", "none", "method", "example", "your name", "your affiliation")
-_PLACEHOLDER_PARTS = ("your_account", "your.account", "@test.", "@example.")
+_PLACEHOLDER_MARKS = ("your_account", "your.account", "@test.", "@example.")
 _BRACKETED = re.compile(r"<[^<>]*>")
 """A text to be replaced, such as <your name>."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Account, method and authors, as `submission.toml` has them.
+    """Account, method and authors, as in `submission.toml`.
 
-    All texts are required, because the server has refused empty ones.
+    All texts are required, because the server has refused empty texts.
     """
 
     account: str
@@ -73,12 +73,12 @@ def read_entry(path: str | PathLike[str], *, account: str | None = None, method:
     """The entry that a TOML file describes.
 
     Args:
-        path: of the file.
-        account: in place of the file's.
-        method: in place of the file's.
+        path: TOML file with the fields of `Entry`.
+        account: E-mail address in place of the file's; None = the file's.
+        method: Name on the leaderboard in place of the file's; None = the file's.
 
     Raises:
-        ConfigError: no such file, unknown, missing or placeholder values; the message names the file.
+        ConfigError: A file that is missing, or unknown, missing or placeholder values; the message names the file.
     """
     way_out = "write one as docs/submission.md shows"
     try:
@@ -86,20 +86,20 @@ def read_entry(path: str | PathLike[str], *, account: str | None = None, method:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file: {way_out}.") from None
     values |= {name: value for name, value in (("account", account), ("method", method)) if value is not None}
-    known = {field.name for field in fields(Entry)}
+    names = {field.name for field in fields(Entry)}
     missing = [f.name for f in fields(Entry) if f.name not in values and f.default is MISSING]
-    unknown = sorted(values.keys() - known)
-    if missing or unknown:
-        problem = f"{', '.join(missing)} missing" if missing else f"{', '.join(unknown)} unknown"
-        raise ConfigError(f"{path}: {problem}; known are {', '.join(sorted(known))}.")
+    surplus = sorted(values.keys() - names)
+    if missing or surplus:
+        problem = f"{', '.join(missing)} missing" if missing else f"{', '.join(surplus)} unknown"
+        raise ConfigError(f"{path}: {problem}; known are {', '.join(sorted(names))}.")
     try:
-        return Entry(**{name: _fitted(name, value) for name, value in values.items()})
+        return Entry(**{name: _validate_value(name, value) for name, value in values.items()})
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
 
 
 def count_parameters(policy: object) -> str:
-    """Number of a policy's weights as the form of the challenge wants it: 7 123 456 is "7M", 512 000 is "512K"."""
+    """Number of a policy's weights in the notation of the challenge's form: 7 123 456 is "7M", 512 000 is "512K"."""
     count = sum(weight.numel() for weight in policy.parameters()) if isinstance(policy, nn.Module) else 0
     for factor, suffix in ((10**12, "T"), (10**9, "B"), (10**6, "M"), (10**3, "K")):
         if count >= factor:
@@ -110,11 +110,11 @@ def count_parameters(policy: object) -> str:
 def describe_entry(entry: Entry, num_parameters: str) -> bytes:
     """Serialized fields of `SimAgentsChallengeSubmission` other than the rollouts.
 
-    The closed-loop flag is set: `submission.build` asks for it before it comes here.
+    The closed-loop flag is set: `submission.build` demands the declaration first.
 
     Args:
-        entry: description of the entry.
-        num_parameters: of `count_parameters`.
+        entry: Account, method and authors that the shards repeat.
+        num_parameters: Number of weights in the form's notation, from `count_parameters`.
     """
     message = SimAgentsChallengeSubmission(
         submission_type=SimAgentsChallengeSubmission.SIM_AGENTS_SUBMISSION,
@@ -151,22 +151,19 @@ def find_problems(message: SimAgentsChallengeSubmission) -> list[str]:
     return problems
 
 
-def _fitted(name: str, value: Any) -> Any:
-    """A value of the file as a field of `Entry` has it."""
+def _validate_value(name: str, value: Any) -> Any:
+    """A value of the file in the type of the field of `Entry`."""
     if name in _LISTS:
-        if not isinstance(value, list) or not all(isinstance(one, str) and one.strip() for one in value):
+        if not isinstance(value, list) or not all(isinstance(text, str) and text.strip() for text in value):
             raise ConfigError(f"{name} must be a list of texts, got {in_short(value)}.")
         return tuple(value)
-    kind, words = (bool, "true or false") if name in _SWITCHES else (str, "text in quotes")
-    if not isinstance(value, kind):
+    value_type, words = (bool, "true or false") if name in _SWITCHES else (str, "text in quotes")
+    if not isinstance(value, value_type):
         raise ConfigError(f"{name} must be {words}, got {in_short(value)}.")
     return value
 
 
 def _is_placeholder(text: str) -> bool:
     lower = text.strip().lower()
-    return (
-        lower in _PLACEHOLDERS
-        or _BRACKETED.search(lower) is not None
-        or any(part in lower for part in _PLACEHOLDER_PARTS)
-    )
+    has_mark = _BRACKETED.search(lower) is not None or any(mark in lower for mark in _PLACEHOLDER_MARKS)
+    return has_mark or lower in _PLACEHOLDERS

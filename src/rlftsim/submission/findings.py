@@ -1,4 +1,4 @@
-"""Problems that are found in an archive, by the number of the check that found them."""
+"""Problems that are found in an archive, by the number of the check."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -28,13 +28,13 @@ CHECKS = {
     17: "the file that was built, unbroken",
 }
 """Title of each check. The 18th of docs/submission.md, a server error without a reason, cannot be checked."""
-MAX_KEPT = 10
-"""Findings of a check that are kept; further ones are counted."""
+MAX_STORED = 10
+"""Findings of a check that are stored; further findings are counted."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One problem and its place."""
+    """A problem and the location in the archive."""
 
     check: int
     """Key of `CHECKS`."""
@@ -46,47 +46,47 @@ class Finding:
     object_id: int | None = None
 
     def __str__(self) -> str:
-        places = (
+        location = (
             self.file,
             self.scenario_id and f"scenario {self.scenario_id}",
             None if self.object_id is None else f"object {self.object_id}",
         )
-        line = f"{', '.join(place for place in places if place)}: {self.text}"
+        line = f"{', '.join(text for text in location if text)}: {self.text}"
         # names in an archive may hold anything, such as control characters and bytes that are no text
         return shorten("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
 
 
 @dataclass
 class Findings:
-    """The first findings of each check, and how many there are."""
+    """The first findings of each check, and the number of all."""
 
-    kept: list[Finding] = field(default_factory=list)
+    stored: list[Finding] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
 
     def add(self, finding: Finding) -> None:
-        """Count a finding, and keep it if it is among the first of its check."""
+        """Count a finding; the first findings of each check are stored."""
         self.counts[finding.check] += 1
-        if self.counts[finding.check] <= MAX_KEPT:
-            self.kept.append(finding)
+        if self.counts[finding.check] <= MAX_STORED:
+            self.stored.append(finding)
 
     def drop(self, check: int) -> list[Finding]:
-        """Forget the findings of a check; returns those that were kept."""
-        dropped = [finding for finding in self.kept if finding.check == check]
-        self.kept = [finding for finding in self.kept if finding.check != check]
+        """Forget the findings of a check; returns the stored findings."""
+        dropped = [finding for finding in self.stored if finding.check == check]
+        self.stored = [finding for finding in self.stored if finding.check != check]
         self.counts.pop(check, None)
         return dropped
 
     @property
     def has_errors(self) -> bool:
         """True if the server would refuse the archive."""
-        return any(finding.severity == "error" for finding in self.kept)
+        return any(finding.severity == "error" for finding in self.stored)
 
     def lines(self) -> list[str]:
-        """A line for each kept finding, and one for the others of each check."""
+        """A line for each stored finding, and a line that counts the remaining findings of each check."""
         lines = []
         for check in sorted(self.counts):
-            own = [finding for finding in self.kept if finding.check == check]
-            lines += [f"{finding.severity}, check {check}: {finding}" for finding in own]
-            if self.counts[check] > len(own):
-                lines.append(f"check {check}: {self.counts[check] - len(own)} more of this kind")
+            findings = [finding for finding in self.stored if finding.check == check]
+            lines += [f"{finding.severity}, check {check}: {finding}" for finding in findings]
+            if self.counts[check] > len(findings):
+                lines.append(f"check {check}: {self.counts[check] - len(findings)} more of this kind")
         return lines

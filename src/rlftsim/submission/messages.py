@@ -1,13 +1,14 @@
-"""Rollouts of one scenario as a serialized `ScenarioRollouts` message, and back, by copying arrays.
+"""Rollouts of a scenario as a serialized `ScenarioRollouts` message, and back, by copying arrays.
 
-A packed float field is the bytes of its array, so a message is a header of a few bytes per array and the arrays
-themselves. Building Python lists of 340 000 numbers for each scenario would take a hundred times as long.
+A packed float field is the bytes of its array, so a message is a header of a few bytes per array and the arrays.
+Building Python lists of 340 000 numbers for each scenario would take a hundred times as long.
 
 Shapes: N rollouts (scenes), A agents, T = 80 steps.
 """
 
 import math
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import torch
@@ -32,13 +33,13 @@ _ID_KEY, _FIRST_KEY, _SECOND_KEY = b"\x30", b"\x0a", b"\x12"
 
 
 def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedStates:
-    """Positions rounded to a power of two of at most `round_m`, headings to an eighth of it; themselves at None.
+    """Positions rounded to a power of two of at most `round_m`, headings to an eighth of that step.
 
     Powers of two leave zeros in the last bits of a float, which compress to nothing.
 
     Args:
-        states: of a scenario.
-        round_m: largest step in meters, such as 0.001.
+        states: Rollouts of a scenario.
+        round_m: Largest step in meters, such as 0.001; None returns the states unchanged.
     """
     if round_m is None:
         return states
@@ -52,7 +53,7 @@ def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedSta
 
 
 def encode_varint(number: int) -> bytes:
-    """A whole number in protobuf's base 128; negative ones take ten bytes, as in an int32 field."""
+    """A whole number in protobuf's base 128; a negative number takes ten bytes, as in an int32 field."""
     number &= (1 << 64) - 1
     digits = bytearray()
     while number >= 0x80:
@@ -66,8 +67,8 @@ def encode_rollouts(scenario_id: str, states: SimulatedStates) -> bytes:
     """Serialized `ScenarioRollouts`, equal to what protobuf writes.
 
     Args:
-        scenario_id: of the scenario.
-        states: of its N rollouts; those that stand for several are written several times.
+        scenario_id: Name under which the server looks up the log.
+        states: States of N rollouts; a rollout that stands for several is written several times.
 
     Raises:
         DataError: An object id that does not fit the message's 32 bits.
@@ -95,9 +96,9 @@ def encode_rollouts(scenario_id: str, states: SimulatedStates) -> bytes:
     scenes = np.empty((len(arrays[0]), len(head) + scene_size), np.uint8)  # [N, bytes]
     at = 0
     for column in (head, *columns):
-        part = column if isinstance(column, np.ndarray) else np.frombuffer(column, np.uint8)
-        scenes[:, at : at + part.shape[-1]] = part
-        at += part.shape[-1]
+        block = column if isinstance(column, np.ndarray) else np.frombuffer(column, np.uint8)
+        scenes[:, at : at + block.shape[-1]] = block
+        at += block.shape[-1]
     name = scenario_id.encode()
     return _FIRST_KEY + encode_varint(len(name)) + name + scenes.tobytes() * states.repeat
 
@@ -109,16 +110,16 @@ class WrongLength:
     scene: int
     object_id: int
     lengths: tuple[int, ...]
-    """Of x, y, z and heading."""
+    """Lengths of x, y, z and heading."""
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedRollouts:
-    """Contents of a `ScenarioRollouts` message, however wrong."""
+    """Contents of a `ScenarioRollouts` message, right or wrong."""
 
     scenario_id: str
     object_ids: tuple[tuple[int, ...], ...]
-    """Of each scene, in its order."""
+    """Agents of each scene, in the order of the message."""
     wrong_lengths: tuple[WrongLength, ...]
     values: Float32[np.ndarray, "N A 4 T"] | None
     """x, y, z, heading, agents in the order of the first scene; None where scenes differ in agents or lengths."""
@@ -128,22 +129,19 @@ def decode_rollouts(data: bytes) -> DecodedRollouts:
     """Contents of a serialized `ScenarioRollouts`, from any writer; fast for scenes that are laid out alike.
 
     Raises:
-        DataError: the bytes are no such message, or name no scenario.
+        DataError: Bytes that are no such message, or name no scenario.
     """
-    decoded = _decode_alike(data)
-    if decoded is None:
-        decoded = _decode_any(data)
-    return decoded
+    return _decode_uniform(data) or _decode_message(data)
 
 
-def _decode_alike(data: bytes) -> DecodedRollouts | None:
-    """Contents where all scenes have the layout of the first one and nothing else is in the message; None if not."""
+def _decode_uniform(data: bytes) -> DecodedRollouts | None:
+    """Contents where all scenes have the layout of the first and fill the message; None for any other message."""
     try:
         name, at = _payload(data, 0, _FIRST_KEY)
         first, stop = _payload(data, at, _SECOND_KEY)
         stride = stop - at
-        num_scenes, rest = divmod(len(data) - at, stride)
-        if rest:
+        num_scenes, remainder = divmod(len(data) - at, stride)
+        if remainder:
             return None
         rows = np.frombuffer(data, np.uint8, offset=at).reshape(num_scenes, stride)
         # 1. the first scene: ids, and where in a row the arrays begin
@@ -151,37 +149,36 @@ def _decode_alike(data: bytes) -> DecodedRollouts | None:
         position = first.start
         while position < first.stop:
             agent, position = _payload(data, position, _FIRST_KEY)
-            inside, own = agent.start, []
+            inside, agent_starts = agent.start, []
             for key in _AXIS_KEYS:
                 array, inside = _payload(data, inside, bytes([key]))
                 if len(array) != _ARRAY_BYTES:
                     return None
-                own.append(array.start - at)
+                agent_starts.append(array.start - at)
             object_id, inside = _varint(data, inside + 1) if data[inside : inside + 1] == _ID_KEY else (-1, -1)
             if inside != agent.stop:
                 return None
-            ids.append(_as_int32(object_id))
-            starts.append(own)
+            ids.append((object_id + (1 << 31)) % (1 << 32) - (1 << 31))  # as an int32
+            starts.append(agent_starts)
     except (IndexError, ValueError):
         return None
     # 2. all other bytes must be equal in all scenes
     is_number = np.zeros(stride, bool)
-    for own in starts:
-        for start in own:
-            is_number[start : start + _ARRAY_BYTES] = True
-    around = rows[:, ~is_number]
-    if not ids or not (around == around[0]).all():
+    for start in chain.from_iterable(starts):
+        is_number[start : start + _ARRAY_BYTES] = True
+    headers = rows[:, ~is_number]
+    if not ids or not (headers == headers[0]).all():
         return None
     values = np.empty((num_scenes, len(ids), len(AXES), FUTURE_STEPS), np.dtype("<f4"))
     as_bytes = values.view(np.uint8)  # [N, A, 4, 4 T]
-    for agent, own in enumerate(starts):
-        for axis, start in enumerate(own):
+    for agent, agent_starts in enumerate(starts):
+        for axis, start in enumerate(agent_starts):
             as_bytes[:, agent, axis] = rows[:, start : start + _ARRAY_BYTES]
     return DecodedRollouts(as_text(data[name.start : name.stop]), (tuple(ids),) * num_scenes, (), values)
 
 
 def _payload(data: bytes, position: int, key: bytes) -> tuple[range, int]:
-    """Bytes of a field of wire type 2 at a position, and the position after it."""
+    """Bytes of a field of wire type 2 at a position, and the position after the field."""
     if data[position : position + 1] != key:
         raise ValueError
     size, start = _varint(data, position + 1)
@@ -191,7 +188,7 @@ def _payload(data: bytes, position: int, key: bytes) -> tuple[range, int]:
 
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:
-    """The number at a position, and the position after it."""
+    """The number at a position, and the position after the number."""
     value = 0
     for shift in range(0, 70, 7):
         byte = data[position]
@@ -202,16 +199,12 @@ def _varint(data: bytes, position: int) -> tuple[int, int]:
     raise ValueError  # no number has more than 10 bytes
 
 
-def _as_int32(number: int) -> int:
-    return (number + (1 << 31)) % (1 << 32) - (1 << 31)
-
-
 def as_text(value: str | bytes) -> str:
-    """Text of a message; protobuf hands over bytes where they are not UTF-8."""
+    """Text of a message; protobuf hands over bytes that are not UTF-8."""
     return value if isinstance(value, str) else value.decode("utf-8", "replace")
 
 
-def _decode_any(data: bytes) -> DecodedRollouts:
+def _decode_message(data: bytes) -> DecodedRollouts:
     """Contents through protobuf's parser."""
     try:
         message = submission_pb2.ScenarioRollouts.FromString(data)
@@ -219,21 +212,21 @@ def _decode_any(data: bytes) -> DecodedRollouts:
         raise DataError(f"not a ScenarioRollouts message ({error})") from error
     if not message.HasField("scenario_id"):
         raise DataError("rollouts that name no scenario")
-    scenes, ids, wrong = [], [], []
+    scenes, ids, wrong_lengths = [], [], []
     for number, scene in enumerate(message.joint_scenes):
         arrays = {}
         ids.append(tuple(trajectory.object_id for trajectory in scene.simulated_trajectories))
         for trajectory in scene.simulated_trajectories:
-            own = (trajectory.center_x, trajectory.center_y, trajectory.center_z, trajectory.heading)
-            lengths = tuple(len(values) for values in own)
+            axes = (trajectory.center_x, trajectory.center_y, trajectory.center_z, trajectory.heading)
+            lengths = tuple(len(values) for values in axes)
             if any(length != FUTURE_STEPS for length in lengths):
-                wrong.append(WrongLength(number, trajectory.object_id, lengths))
+                wrong_lengths.append(WrongLength(number, trajectory.object_id, lengths))
             else:
-                arrays[trajectory.object_id] = np.array(own, np.float32)  # [4, T]
+                arrays[trajectory.object_id] = np.array(axes, np.float32)  # [4, T]
         scenes.append(arrays)
     values = None
     # An id that is listed twice has one array: then the numbers of ids and of arrays differ.
-    alike = all(len(arrays) == len(own) and arrays.keys() == scenes[0].keys() for arrays, own in zip(scenes, ids))
-    if scenes and scenes[0] and alike:
+    is_uniform = all(len(a) == len(agents) and a.keys() == scenes[0].keys() for a, agents in zip(scenes, ids))
+    if scenes and scenes[0] and is_uniform:
         values = np.array([[arrays[object_id] for object_id in ids[0]] for arrays in scenes], np.float32)
-    return DecodedRollouts(as_text(message.scenario_id), tuple(ids), tuple(wrong), values)
+    return DecodedRollouts(as_text(message.scenario_id), tuple(ids), tuple(wrong_lengths), values)

@@ -1,4 +1,4 @@
-"""Plan of a submission: which scenarios go into which shard, and what all of it depends on."""
+"""Plan of a submission: the scenarios of each shard, and the settings that the bytes depend on."""
 
 import hashlib
 import re
@@ -43,7 +43,7 @@ class Plan:
         return sum(self.num_agents) * NUM_SCENES * TRAJECTORY_BYTES
 
     def claim(self, folder: Path) -> None:
-        """Write the plan into a folder, or compare the plan with a stored one.
+        """Write the plan into a folder, or compare the plan with the stored plan.
 
         Raises:
             ConfigError: The folder holds work on another plan.
@@ -67,18 +67,18 @@ def make_plan(
     num_shards: int,
     round_m: float | None,
 ) -> Plan:
-    """Cut a split into shards of about equal numbers of agents, in its order.
+    """Shards of about equal numbers of agents, in the order of the split.
 
     Args:
-        data: the split.
-        policy_fingerprint: of the policy.
-        metadata: serialized fields that each shard repeats.
-        config: settings of the simulation.
-        num_shards: files of the archive; fewer where there are fewer scenarios.
-        round_m: positions are rounded to this; None = not.
+        data: Scenarios of the split that is simulated.
+        policy_fingerprint: Hash of the policy's weights and code; another policy makes another plan.
+        metadata: Serialized fields that each shard repeats.
+        config: Settings of the simulation; all that change a number are in the plan.
+        num_shards: Files of the archive; fewer for a split with fewer scenarios.
+        round_m: Step that positions are rounded to, in meters; None = not rounded.
 
     Raises:
-        ConfigError: no shards, a step of nothing or above 1 m, or another number of rollouts than the challenge wants.
+        ConfigError: No shards, a step of nothing or above 1 m, or a number of rollouts that the challenge refuses.
     """
     agents = data.num_agents
     if num_shards < 1:
@@ -112,24 +112,24 @@ def make_plan(
 
 
 def check_sources(data: ScenarioDataset) -> None:
-    """Refuse recordings that are not Waymo's, the only ones the leaderboard knows; synthetic scenarios are practice.
+    """Check that recordings are Waymo's, which alone are on the leaderboard; synthetic scenarios are practice.
 
     Raises:
-        DataError: the data set has scenarios of another source.
+        DataError: A data set with scenarios of another source.
     """
-    others = sorted(set(data.sources) - {"womd", "synthetic", "unknown"})
-    if others:
+    sources = sorted(set(data.sources) - {"womd", "synthetic", "unknown"})
+    if sources:
         raise DataError(
-            f"{data.folder}: scenarios of the source {' and '.join(others)}: the Sim Agents server scores WOMD alone; "
+            f"{data.folder}: scenarios of the source {' and '.join(sources)}: the Sim Agents server scores WOMD alone; "
             "convert a split of it, or score these rollouts with `rlftsim evaluate`."
         )
 
 
 def check_complete(data: ScenarioDataset) -> None:
-    """Refuse a split that lacks files, before anything is simulated: the server wants every scenario of it.
+    """Check that no file of a split is missing before the simulation: the server wants every scenario.
 
     Raises:
-        DataError: a shard of the data set is missing, a source file was not converted, or records were lost.
+        DataError: A shard of the data set is missing, a source file was not converted, or records were lost.
     """
     missing = [name for name in sorted(set(data.index["shard"].to_pylist())) if not (data.folder / name).is_file()]
     if missing and data.url is None:
@@ -145,11 +145,11 @@ def check_complete(data: ScenarioDataset) -> None:
     for match in (_NUMBERED.fullmatch(entry.source or "") for entry in entries):
         if match:
             numbers.setdefault((match[1], int(match[3])), set()).add(int(match[2]))
-    for (name, count), found in numbers.items():
-        absent = sorted(set(range(count)) - found)
+    for (name, count), converted in numbers.items():
+        absent = sorted(set(range(count)) - converted)
         if absent:
             raise DataError(
-                f"{data.folder}: split {data.split} was converted from {len(found)} of {count} files, "
+                f"{data.folder}: split {data.split} was converted from {len(converted)} of {count} files, "
                 f"{name}-{absent[0]:05d}-of-{count:05d} is missing: convert it, too, or try things out with --partial; "
                 "the server refuses a submission without it."
             )

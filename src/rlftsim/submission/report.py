@@ -1,6 +1,6 @@
-"""Report of a built archive, for its authors: what is in it, how it was made and checked, what to expect of it.
+"""Report of a built archive, for the authors: contents, origin, checks and the realism to expect.
 
-It names the method and not the account, so that it may be shared.
+The report names the method and not the account, so that authors may share the file.
 """
 
 import json
@@ -27,7 +27,7 @@ report."""
 
 @dataclass(frozen=True)
 class Estimate:
-    """Realism to be expected of an entry: that of the same model and settings on the validation split."""
+    """Realism to be expected of an entry: the same model and settings on the validation split."""
 
     evaluation: str
     """File of the evaluation."""
@@ -40,32 +40,32 @@ class Estimate:
 
 
 def estimate_realism(path: str | PathLike[str], policy_fingerprint: str, config: EvaluateConfig) -> Estimate | str:
-    """Realism of an earlier evaluation, or why it says nothing about an entry.
+    """Realism of an earlier evaluation, or the reason why the evaluation says nothing about an entry.
 
     Args:
-        path: of the evaluation, as `rlftsim evaluate` wrote it.
-        policy_fingerprint: of the entry's policy.
-        config: settings of the entry's simulation.
+        path: File that `rlftsim evaluate` wrote.
+        policy_fingerprint: Hash of the entry's policy; an evaluation of another policy is no estimate.
+        config: Settings of the entry's simulation; the evaluation may differ in the split.
     """
     try:
         evaluation = Evaluation.read(path)
     except DataError as error:
         return str(error)
-    about = evaluation.provenance
-    if about.policy_fingerprint != policy_fingerprint:
+    provenance = evaluation.provenance
+    if provenance.policy_fingerprint != policy_fingerprint:
         return f"{path} is of another model."
-    mine, theirs = config.what_counts(), replace(about.config, split=config.split).what_counts()
-    differing = [name for name in mine if mine[name] != theirs.get(name)]
+    settings, evaluated = config.what_counts(), replace(provenance.config, split=config.split).what_counts()
+    differing = [name for name in settings if settings[name] != evaluated.get(name)]
     if differing:
         return f"{path} was evaluated with another {', '.join(differing)}."
-    found = evaluation.mean_and_error("meta_metric")
-    light_one = evaluation.mean_and_error("meta_metric_light_one").mean
-    return Estimate(str(path), found.count, found.mean, found.interval, light_one)
+    rmm = evaluation.mean_and_error("meta_metric")
+    rmm_without_light = evaluation.mean_and_error("meta_metric_light_one").mean
+    return Estimate(str(path), rmm.count, rmm.mean, rmm.interval, rmm_without_light)
 
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that is known about an archive."""
+    """Contents, checks, origin and expected realism of an archive."""
 
     archive: str
     bytes: int
@@ -105,46 +105,26 @@ class Report:
         ]
         findings = [f"* {finding.severity}, check {finding.check}: {finding}" for finding in self.findings]
         work = [f"* {name}: {value}" for name, value in self.work.items()]
-        return "\n".join(
-            [
-                f"# Submission {self.archive}: {self.method}",
-                "",
-                f"* {self.bytes} bytes ({self.bytes / 1e9:.3g} GB), SHA-256 `{self.sha256}`",
-                f"* {self.scenarios} scenarios in {self.shards} shards, {self.trajectories} trajectories, "
-                f"{self.message_bytes / 1e9:.3g} GB of messages",
-                f"* {self.num_parameters} parameters; built and checked in {self.seconds:.0f} s",
-                *work,
-                "",
-                "## Checks",
-                "",
-                "| | check | result |",
-                "|---|---|---|",
-                *checks,
-                "",
-                *findings,
-                "",
-                "## Realism to expect",
-                "",
-                *_estimate_lines(self.estimate),
-                "",
-                "## Closed loop",
-                "",
-                self.closed_loop,
-                "",
-                "## Model",
-                "",
-                self.card,
-                "",
-                "## After the upload",
-                "",
-                SERVER_ERRORS,
-                "",
-            ]
-        )
+        contents = [
+            f"* {self.bytes} bytes ({self.bytes / 1e9:.3g} GB), SHA-256 `{self.sha256}`",
+            f"* {self.scenarios} scenarios in {self.shards} shards, {self.trajectories} trajectories, "
+            f"{self.message_bytes / 1e9:.3g} GB of messages",
+            f"* {self.num_parameters} parameters; built and checked in {self.seconds:.0f} s",
+            *work,
+        ]
+        sections = {
+            f"# Submission {self.archive}: {self.method}": contents,
+            "## Checks": ["| | check | result |", "|---|---|---|", *checks, "", *findings],
+            "## Realism to expect": _estimate_lines(self.estimate),
+            "## Closed loop": [self.closed_loop],
+            "## Model": [self.card],
+            "## After the upload": [SERVER_ERRORS],
+        }
+        return "\n".join(line for title, lines in sections.items() for line in (title, "", *lines, ""))
 
 
 def model_card(name: str) -> str:
-    """Card of a model, its headings two levels down; a sentence where there is none."""
+    """Card of a model, with headings two levels down; a sentence for a model without a card."""
     return read_card(name) or f"{name} is no model folder, so it has no card."
 
 
@@ -152,7 +132,7 @@ def report_path(archive: Path, ending: str) -> Path:
     """Path of an archive's report.
 
     Args:
-        archive: the .tar.gz.
+        archive: Path of the .tar.gz; the report lies in the same folder.
         ending: "md" or "json".
     """
     return archive.with_name(f"{archive.name.removesuffix('.tar.gz')}.report.{ending}")
@@ -167,16 +147,16 @@ def reported_sha256(archive: Path) -> str | None:
 
 
 def select_findings(check: ArchiveCheck) -> tuple[tuple[Finding, ...], dict[int, int]]:
-    """The findings of a check as a report has them, and how many there are of each number."""
-    return tuple(check.findings.kept), dict(sorted(check.findings.counts.items()))
+    """The findings of a check in the form of a report, and the number of findings of each check."""
+    return tuple(check.findings.stored), dict(sorted(check.findings.counts.items()))
 
 
 def write_findings(check: ArchiveCheck, path: Path) -> None:
     """Write the findings of a check as JSON.
 
     Args:
-        check: of any archive.
-        path: of the file.
+        check: Check of an archive of any writer.
+        path: File that is written or replaced.
     """
     findings, counts = select_findings(check)
     values = {
@@ -210,6 +190,6 @@ def _estimate_lines(estimate: Estimate | str) -> list[str]:
     ]
     for name, value in BOARD.items():
         difference = estimate.rmm_light_one - value
-        noise = " (within noise)" if abs(difference) <= half else ""
-        lines.append(f"| {name} | {value:.4f} | {difference:+.4f}{noise} |")
+        note = " (within noise)" if abs(difference) <= half else ""
+        lines.append(f"| {name} | {value:.4f} | {difference:+.4f}{note} |")
     return lines

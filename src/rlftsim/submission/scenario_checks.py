@@ -1,6 +1,6 @@
-"""Checks of one scenario's rollouts against its log: numbers 1, 3, 4, 8 and 10 to 14 of `findings.CHECKS`.
+"""Checks of a scenario's rollouts against the log: numbers 1, 3, 4, 8 and 10 to 14 of `findings.CHECKS`.
 
-`submit build` makes them before it appends a scenario, `submit check` on the finished archive.
+`submit build` makes these checks before a scenario is appended, `submit check` on the finished archive.
 """
 
 from collections import Counter
@@ -18,22 +18,22 @@ _CHECK_OF_SUBJECT = {"not finite": 10, "distance": 10, "heading": 11, "turn": 11
 
 @dataclass(frozen=True)
 class ScenarioCheck:
-    """Findings of one scenario, and numbers that are judged over all scenarios."""
+    """Findings of a scenario, and numbers that are judged over all scenarios."""
 
     findings: tuple[Finding, ...]
     num_agents: int = 0
     """Trajectories, agents times scenes."""
     num_jumps: int = 0
-    """Of these, with a first step away from constant velocity."""
+    """Trajectories with a first step away from constant velocity."""
 
 
 def check_rollouts(decoded: DecodedRollouts, scenario: Scenario, file: str) -> ScenarioCheck:
-    """Compare a scenario's rollouts with its log.
+    """Findings of the comparison of a scenario's rollouts with the log.
 
     Args:
-        decoded: the rollouts.
-        scenario: the log up to the current step.
-        file: name of the shard, for the findings.
+        decoded: Rollouts as read from the message.
+        scenario: Scenario with the log up to the current step; a future is not read.
+        file: Name of the shard, for the findings.
     """
     findings = list(_structure(decoded, scenario, file))
     if findings or decoded.values is None:
@@ -55,9 +55,9 @@ def _structure(decoded: DecodedRollouts, scenario: Scenario, file: str) -> Itera
     name = decoded.scenario_id
     if len(decoded.object_ids) != NUM_SCENES:
         yield Finding(3, "error", f"{len(decoded.object_ids)} scenes instead of {NUM_SCENES}", file, name)
-    for wrong in decoded.wrong_lengths[:1]:
-        text = f"x, y, z and heading have {list(wrong.lengths)} steps in scene {wrong.scene}"
-        yield Finding(4, "error", text, file, name, wrong.object_id)
+    for agent in decoded.wrong_lengths[:1]:
+        text = f"x, y, z and heading have {list(agent.lengths)} steps in scene {agent.scene}"
+        yield Finding(4, "error", text, file, name, agent.object_id)
     expected = frozenset(scenario.tracks.object_id[scenario.simulated_indices].tolist())
     for scene, ids in enumerate(decoded.object_ids):
         if scene and ids == decoded.object_ids[scene - 1]:
@@ -68,7 +68,7 @@ def _structure(decoded: DecodedRollouts, scenario: Scenario, file: str) -> Itera
             return
         missing, extra = expected - set(ids), set(ids) - expected
         if missing or extra:
-            parts = [("missing", missing), ("not simulated in this scenario", extra)]
-            said = "; ".join(f"{word}: {', '.join(map(str, sorted(some)[:10]))}" for word, some in parts if some)
-            yield Finding(1, "error", f"scene {scene}: {said}", file, name, min(missing or extra))
+            groups = [("missing", missing), ("not simulated in this scenario", extra)]
+            text = "; ".join(f"{word}: {', '.join(map(str, sorted(ids)[:10]))}" for word, ids in groups if ids)
+            yield Finding(1, "error", f"scene {scene}: {text}", file, name, min(missing or extra))
             return

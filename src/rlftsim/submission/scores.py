@@ -1,4 +1,4 @@
-"""Realism of the rollouts in an archive, scored while it is checked: the number that the file itself will get."""
+"""Realism of the rollouts in an archive, scored during the check: the number that the file will get."""
 
 import numpy as np
 import pyarrow as pa
@@ -23,11 +23,11 @@ class ArchiveScores:
         self._skipped: list[Skipped] = []
 
     def __call__(self, scenario: Scenario, decoded: DecodedRollouts) -> None:
-        """Score one scenario.
+        """Score a scenario.
 
         Args:
-            scenario: with its future.
-            decoded: rollouts without an error.
+            scenario: Scenario with the logged future that the metric compares with.
+            decoded: Rollouts without an error.
         """
         if not has_road_edge(scenario):
             self._skipped.append(Skipped(scenario.scenario_id, "has no road edge"))
@@ -42,9 +42,9 @@ class ArchiveScores:
         """The scores, in the order of the archive.
 
         Args:
-            name: of the row in tables.
-            data: the scenarios.
-            sha256: of the archive.
+            name: Name of the row in tables.
+            data: Scenarios of the archive's split.
+            sha256: Checksum of the archive, in place of a policy's fingerprint.
         """
         provenance = Provenance(
             config=EvaluateConfig(num_rollouts=NUM_SCENES, metric=self._metric.name, split=data.split),

@@ -1,4 +1,4 @@
-"""Large archives cut into parts, for moving them about. The upload page takes the joined file."""
+"""Large archives cut into parts for transport. The upload page takes the joined file."""
 
 import math
 import os
@@ -12,9 +12,9 @@ _CHUNK = 1 << 22
 
 
 def split_file(path: Path, part_gb: float) -> list[Path]:
-    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins them.
+    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins the parts.
 
-    Parts of an earlier cut are removed when all new ones are written.
+    Parts of an earlier cut are removed when all new parts are written.
 
     Args:
         path: File that is copied, and stays.
@@ -22,7 +22,7 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
 
     Raises:
         ConfigError: More than 1000 parts.
-        DataError: A part cannot be written; those of an earlier cut are left as they are.
+        DataError: A part cannot be written; parts of an earlier cut are left unchanged.
     """
     part_bytes = int(part_gb * 1e9) if 0 < part_gb < math.inf else 0
     count = -(-path.stat().st_size // part_bytes) if part_bytes else 0

@@ -1,7 +1,8 @@
-"""Alarms: a policy that exploits its reward drifts away from the log in ways that a few statistics show.
+"""Alarms: a policy that exploits the reward drifts away from the log in ways that a few statistics show.
 
 Running means of these statistics are compared with those of the run's first updates. The level of an alarm is the drift
-over its threshold, so it is raised from 1 on. A warning is logged once when it is raised; the run goes on.
+over the threshold, so the alarm is raised from 1 on. A warning is logged once when the alarm is raised; the run goes
+on.
 """
 
 import math
@@ -38,7 +39,7 @@ class AlarmConfig:
 
 @dataclass(frozen=True)
 class DriftMonitor:
-    """One statistic that is watched."""
+    """A statistic that is watched."""
 
     alarm: str
     """Name of the alarm in the metrics."""
@@ -81,7 +82,7 @@ DRIFT_MONITORS = (
 
 @dataclass(frozen=True)
 class Running:
-    """Means of a statistic. Values that are not finite leave them as they are."""
+    """Means of a statistic. Values that are not finite leave the means unchanged."""
 
     start: float = 0.0
     """Over the first updates."""
@@ -91,7 +92,7 @@ class Running:
     """Updates with a finite value."""
 
     def add(self, value: float, config: AlarmConfig) -> "Running":
-        """The means with one more update.
+        """The means with a further update.
 
         Args:
             value: Value of the statistic in that update; not counted where not finite.
@@ -109,7 +110,7 @@ class Running:
 
 @dataclass
 class Alarms:
-    """The watched means of a run, which its checkpoints hold."""
+    """The watched means of a run, which checkpoints hold."""
 
     means: dict[str, Running] = field(default_factory=lambda: {m.alarm: Running() for m in DRIFT_MONITORS})
 

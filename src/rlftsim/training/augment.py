@@ -18,11 +18,11 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, check_positive, check_types, given
 from rlftsim.goals.logged import logged_goals
-from rlftsim.goals.stored import write_goal_file
+from rlftsim.goals.stored import read_goal_file, write_goal_file
 from rlftsim.goals.types import Points
 from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease
-from rlftsim.jobs.items import GroupFormat, group_positions, group_task, run_items
+from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.runner import Inline, Runner
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -73,7 +73,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class _GoalFiles(GroupFormat[Path, tuple[str, Any]]):
-    """Ids and `Points` of some scenarios, see `goals.stored`. A file that exists is finished: it is written whole."""
+    """Ids and `Points` of some scenarios, see `goals.stored`."""
 
     folder: Path
     size: int
@@ -87,7 +87,7 @@ class _GoalFiles(GroupFormat[Path, tuple[str, Any]]):
 
     def read(self, item: range) -> Path | None:
         """The file of a group, see `ResultFormat`."""
-        return self._path(item) if self._path(item).exists() else None
+        return None if read_stored(self._path(item), read_goal_file) is None else self._path(item)
 
 
 def augment_goals(
@@ -113,8 +113,8 @@ def augment_goals(
         Number of scenarios that have goals now.
 
     Raises:
-        DataError: A scenario withholds the future, or another driver is at work in the folder.
-        CheckpointError: The folder holds goals of another policy, other scenarios or other settings.
+        DataError: A scenario withholds the future, or a second driver is at work in the folder.
+        CheckpointError: The folder holds goals of a different policy, other scenarios or other settings.
         ConfigError: `top_k` is set and the policy's decisions are not categories.
         SetAside, Unfinished: See `run_items`.
     """

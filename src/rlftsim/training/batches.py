@@ -1,6 +1,6 @@
 """Scenarios of an update, spread over processes and cut into pieces that fit into memory.
 
-Losses are sums that are divided by global counts, so nothing here changes a gradient: only its time and memory.
+Losses are sums that are divided by global counts, so this module never changes a gradient, only time and memory.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def count_columns(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndar
     """Counts of each scenario by columns of the index, from the index of a data set without a scenario being read.
 
     Args:
-        scenarios: a data set, or others, which are counted here.
+        scenarios: a data set, or scenarios of other types, which are counted here.
         columns: fields of `IndexRow` that are numbers.
     """
     if isinstance(scenarios, ScenarioDataset):
@@ -62,7 +62,7 @@ def check_scored(scenarios: Scenarios) -> None:
 
 
 def balance_by_cost(costs: Sequence[float] | Float[np.ndarray, "n"], num_groups: int) -> list[list[int]]:
-    """Greedy load balancing: places of a list, in parts of about equal cost, so that no process waits long for another.
+    """Greedy load balancing: places of a list, in parts of about equal cost, so that no process waits long.
 
     The most expensive place goes first, each to the part that is cheapest so far; equal costs are dealt out in turn.
 
@@ -89,7 +89,7 @@ def micro_batches(
         items: Indices of the scenarios in the data set.
         costs: Costs [n] of all scenarios of the data set, thousands of map points.
         max_count: Scenarios of a batch at most.
-        max_cost: Summed cost of a batch at most; a scenario that costs more is a batch by itself. None = no limit.
+        max_cost: Summed cost of a batch at most; a scenario that costs more is a batch alone. None = no limit.
     """
     budget = np.inf if max_cost is None else max_cost
     batches: list[list[int]] = []

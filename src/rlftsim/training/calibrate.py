@@ -1,15 +1,15 @@
-"""Calibration: weights of a few named features on the token logits, fitted to a realism reward in one step.
+"""Calibration: weights of a few named features on the token logits, fitted to a realism reward in a single step.
 
     eta = length * natural direction(gradient of the reward, Fisher matrix, gradients of constrained means)
 
 1. Rollouts of most of the training scenarios. The score function of the weights, summed over an agent's decisions,
-   times what the agent earned is an estimate of the reward's gradient; its covariance is the Fisher matrix. There is no
+   times the agent's reward is an estimate of the reward's gradient; the covariance is the Fisher matrix. There is no
    backward pass through the network, no optimizer and no learning rate.
-2. The direction of the largest predicted gain per KL, of those that leave the constrained means as they are.
-3. Its length: rollouts of the scenarios that were held back, with the same noise for each length that is tried.
+2. The direction of the largest predicted gain per KL among the directions that leave the constrained means unchanged.
+3. The length: rollouts of the scenarios that were held back, with the same noise for each length that is tried.
 
-A few weights need few rollouts: the signal of ten features is as large as their noise after some hundreds of rollouts,
-that of all weights of a network is not after tens of thousands. K features, C constraints, N rollouts, A agents.
+A few weights need few rollouts: the signal of ten features is as large as the noise after some hundreds of rollouts,
+the signal of all weights of a network is not after tens of thousands. K features, C constraints, N rollouts, A agents.
 """
 
 import math
@@ -54,7 +54,7 @@ FEATURES = (
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """Calibration of a model with a vocabulary: a few named features on its token logits."""
+    """Calibration of a model with a vocabulary: a few named features on the token logits."""
 
     features: tuple[str, ...] = FEATURES
     """Names of the features; `rlftsim.features` is their entry-point group."""
@@ -116,13 +116,13 @@ class CalibrateConfig:
         return 1
 
     def split(self, num_scenarios: int) -> tuple[list[int], list[int]]:
-        """Scenarios for the direction, and those held back for its length.
+        """Scenarios for the direction, and scenarios held back for the length.
 
         Args:
             num_scenarios: Number of scenarios in the data set, at least 2.
 
         Raises:
-            ConfigError: Fewer than two.
+            ConfigError: Fewer than two scenarios.
         """
         if num_scenarios < 2:
             raise ConfigError("calibration needs at least 2 scenarios: one for the direction and one for its length.")
@@ -132,8 +132,9 @@ class CalibrateConfig:
         return selected[num_held_back:], selected[:num_held_back]
 
     def tasks(self, num_scenarios: int) -> list[tuple[int | None, list[int]]]:
-        """Batches of the run in their order: which length they try (0 = none of it; None = they find the direction),
-        and positions in the list of those scenarios.
+        """Batches of the run in order, each a stage and positions in the list of the stage's scenarios.
+
+        Stage None finds the direction, stage 0 measures without a step, stage i tries length i.
 
         Args:
             num_scenarios: Number of scenarios in the data set, at least 2.
@@ -177,12 +178,12 @@ class CalibrateMethod(Method[CalibrateConfig]):
         return CalibrationLearner(policy=policy, optimizer=optimizer, config=settings, scenarios=scenarios)
 
     def update(self, learner: "CalibrationLearner", scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
-        """Measure the next batch of scenarios, which the learner chooses itself."""
+        """Measure the next batch of scenarios, chosen by the learner."""
         return learner.measure(fabric)
 
 
 class Statistics(nn.Module):
-    """What was measured in each scenario so far: all that a run resumes from.
+    """Measurements of each scenario so far: all that a run resumes from.
 
     Args:
         num_fitted: Scenarios for the direction.
@@ -211,7 +212,7 @@ class Statistics(nn.Module):
 
 @dataclass(eq=False, kw_only=True)
 class CalibrationLearner(Learner):
-    """A policy whose features get weights, and the statistics that these follow from."""
+    """A policy with weights for features, and the statistics that the weights follow from."""
 
     scenarios: Scenarios
 
@@ -229,14 +230,14 @@ class CalibrationLearner(Learner):
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """The statistics: a checkpoint needs nothing else."""
+        """The statistics: a checkpoint needs no other modules."""
         return {"statistics": self.statistics}
 
     def measure(self, fabric: Fabric) -> UpdateReport:
         """Measure the next batch of scenarios.
 
         Args:
-            fabric: Processes, each of which measures a part of them.
+            fabric: Processes, each of which measures a part of the batch.
         """
         stage, positions = self.tasks[self.update]
         # Row by row and added to zeros, so that no number depends on the processes.
@@ -267,7 +268,7 @@ class CalibrationLearner(Learner):
         return natural_direction(mean[0], self.statistics.fisher.numpy() / max(decisions, 1.0), fixed, self.config.kl)
 
     def fit(self) -> tuple[Float64[np.ndarray, "K"], dict[str, Any]]:
-        """The weights, and how they came about: values that JSON has."""
+        """The weights, and a record of the fit: values that JSON has."""
         scores = {name: self.statistics.scores[..., index].numpy() for index, name in enumerate(self.names)}
         kls = scores["kl"].sum(1) / scores["num_decisions"].sum(1).clip(1)  # [1 + X]
         gains = scores["rmm"][1:] - scores["rmm"][0]  # [X, S]

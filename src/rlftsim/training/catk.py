@@ -1,13 +1,13 @@
 """CAT-K ("closest among top-K") and RoaD ("rollouts as demonstrations"): learning along rollouts near the log.
 
-In a CAT-K rollout each agent takes, among its K most likely tokens, the one that leads nearest to its next logged
-state; where that is not valid, its most likely token. The loss is the cross-entropy of the token that leads
-nearest of the whole vocabulary, from the state that the rollout has reached.
+In a CAT-K rollout each agent takes, among the K most likely tokens, the token that leads nearest to the next logged
+state; where that state is not valid, the most likely token. The loss is the cross-entropy of the token of the whole
+vocabulary that leads nearest, from the state that the rollout has reached.
 
-In a RoaD rollout each agent takes, among K tokens sampled from the policy, the one that leads nearest to its next
-logged state. The loss is the cross-entropy of the tokens of the rollout itself: CAT-K teaches to come back to the log
-at once, RoaD teaches those of the policy's own decisions that led near it. The rollouts of an epoch are those of the
-policy at its start.
+In a RoaD rollout each agent takes, among K tokens sampled from the policy, the token that leads nearest to the next
+logged state. The loss is the cross-entropy of the rollout's own tokens: CAT-K teaches to come back to the log at once,
+RoaD teaches the policy's own decisions that led near the log. The rollouts of an epoch are made by the policy at the
+start of the epoch.
 
 Sources: Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models", 2025; Garcia-Cobo et al.,
 "RoaD: Rollouts as Demonstrations for Closed-Loop Supervised Fine-Tuning of Autonomous Driving Policies", 2025
@@ -37,8 +37,11 @@ from rlftsim.training.parallel import Fabric
 
 @dataclass(frozen=True)
 class CatkConfig(ImitationConfig):
-    """Fine-tuning with CAT-K. The defaults are the published ones for SMART-tiny on WOMD, but for the epochs:
-    its file says 32, RLFTSim finds the optimum between a quarter and one."""
+    """Fine-tuning with CAT-K.
+
+    The defaults are published for SMART-tiny on WOMD, but for the epochs: the published file says 32, RLFTSim finds the
+    optimum between a quarter and one.
+    """
 
     epochs: float = 1.0
     learning_rate: float = 5e-5
@@ -78,14 +81,17 @@ class RoadConfig(CatkConfig):
 
 
 class CatkMethod(ImitationMethod[CatkConfig]):
-    """CAT-K. A batch is encoded once, with gradient; its rollout (dropout active, no gradient) and the pass that scores
-    the targets share that context, and the scoring pass draws a dropout of its own."""
+    """CAT-K.
+
+    A batch is encoded once, with gradient. The rollout (dropout active, no gradient) and the pass that scores the
+    targets share that context, and the scoring pass draws a separate dropout.
+    """
 
     settings = CatkConfig
     title = "CAT-K"
 
     def describe(self, settings: CatkConfig) -> str:
-        """CAT-K and the choice of its rollouts."""
+        """CAT-K and the choice of rollouts."""
         return f"CAT-K, {settings.choice}"
 
     def start(self, policy: Any, scenarios: Scenarios, settings: CatkConfig, fabric: Fabric) -> Imitator:
@@ -122,7 +128,7 @@ class CatkMethod(ImitationMethod[CatkConfig]):
 
 
 class RoadMethod(CatkMethod):
-    """RoaD: CAT-K with other rollouts and targets, which its settings choose."""
+    """RoaD: CAT-K with other rollouts and targets, as the settings choose."""
 
     settings = RoadConfig
     title = "RoaD"

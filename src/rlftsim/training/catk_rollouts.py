@@ -55,25 +55,24 @@ def roll_out_closest(
 ) -> TargetedRollouts:
     """Simulate with CAT-K.
 
-    Without dropout nothing in "closest" is random: more than one rollout makes sense for a policy in training
-    mode only.
+    Without dropout "closest" is not random: several rollouts make sense for a policy in training mode only.
 
     Args:
         policy: decides for every agent.
-        batch: scenarios with their future.
+        batch: scenarios with futures.
         num_candidates: Number K of candidate tokens of each decision, at least 1.
         choice: see `Choice`.
         targets: see `Targets`.
         max_distance_lengths: see `CatkConfig`.
         num_rollouts: Number N of rollouts of each scenario.
-        seed: Seed of the samples and of what else is random in the policy.
-        context: `policy.encode(batch)`, if it has been computed.
-        goals: Goals of the agents, as `simulate` takes them; None = goal-free.
+        seed: Seed of the samples and of all other randomness in the policy.
+        context: `policy.encode(batch)`, if computed already.
+        goals: Goals of the agents, as in `simulate`; None = goal-free.
         catk_compat: round where the public code rounds, see `tokens.catk_compat`.
 
     Returns:
-        The rollouts with their targets, where the next logged state is valid and the present state is not too far off
-        the log.
+        The rollouts with targets, where the next logged state is valid and the present state is not too far off the
+        log.
 
     Raises:
         ConfigError: no candidates.
@@ -119,7 +118,7 @@ def roll_out_closest(
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """Poses of the agents in a simulation, and the logged ones of the same step and of the next."""
+    """Poses of the agents in a simulation, and the logged poses of the same step and of the next."""
 
     pose: Pose
     logged_start: Pose
@@ -137,7 +136,7 @@ class _Target:
         return tokens_towards(self.logged, self.pose, self.class_id, self.logged_valid, self.vocabulary)
 
     def is_near_log(self, max_lengths: float | None) -> Bool[Tensor, "B N A"]:
-        """True for agents within so many lengths of their class's box from their logged position, or without one."""
+        """True for agents within so many lengths of the class's box from the logged position; also without a log."""
         if max_lengths is None:
             return torch.ones_like(self.logged_valid)
         length, _ = box_of_class(self.class_id)
@@ -149,7 +148,7 @@ class _Target:
 
         Args:
             ids: K candidate tokens of each agent.
-            mask: True = one of the R agents.
+            mask: True = an agent among the R agents.
         """
         pick = partial(pick_rows, mask=mask, is_dense=len(ids) == mask.numel())
         class_id = pick(self.class_id)  # [R]
@@ -166,7 +165,7 @@ class _Target:
 def _targets(
     batch: ScenarioBatch, tokens: AgentTokens, vocabulary: Vocabulary, catk_compat: bool
 ) -> Iterator[Callable[[Pose], _Target]]:
-    """Yield for each decision the function from the simulation's poses to their targets."""
+    """Yield for each decision the function from the simulation's poses to targets."""
     for step in range(HISTORY_TOKENS, tokens.logged_valid.shape[-1]):
 
         def make_target(pose: Pose, step: int = step) -> _Target:

@@ -1,7 +1,7 @@
-"""Checkpoints: everything that a run resumes from, in files that execute nothing.
+"""Checkpoints: all that a run resumes from, in files without code.
 
-A checkpoint is a folder `update-00000120` with safetensors and a JSON file. It is written under another name and
-renamed when it is whole, so a folder of that name is never half-written.
+A checkpoint is a folder `update-00000120` with safetensors and a JSON file. The folder is written under a temporary
+name and renamed when whole, so a folder of that name is never half-written.
 """
 
 import json
@@ -41,7 +41,7 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
         folder: the run's folder of checkpoints.
         progress: position of the run.
         modules: weights by file name, such as policy and reference.
-        optimizer: its moments are kept too.
+        optimizer: Optimizer with the moments to store, too.
 
     Raises:
         DataError: a file cannot be written, such as on a full disk; names it. Older checkpoints are untouched.
@@ -68,12 +68,12 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The latest whole checkpoint of a run; None if it has none yet."""
+    """The latest whole checkpoint of a run; None if there is none yet."""
     return max(_checkpoints(folder), default=None)
 
 
 def _checkpoints(folder: Path) -> list[Path]:
-    """Whole checkpoints of a run, the latest last; anything else of a similar name is a user's."""
+    """Whole checkpoints of a run, the latest last; other files of a similar name belong to a user."""
     return sorted(path for path in folder.glob(f"{PREFIX}*") if path.name.removeprefix(PREFIX).isdecimal())
 
 
@@ -86,7 +86,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     """Load weights and moments in place.
 
     Args:
-        path: Folder of the checkpoint, named after its update.
+        path: Folder of the checkpoint, named after the update.
         modules: Modules by the names that `write_checkpoint` got; weights are loaded in place.
         optimizer: Optimizer with the same parameters in the same order; the learning rate stays.
 
@@ -94,7 +94,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         The position of the run.
 
     Raises:
-        CheckpointError: damaged, or of another model.
+        CheckpointError: damaged, or of a different model.
     """
     way_out = "cannot go on from it, delete this folder to go on from an older one"
     try:
@@ -125,10 +125,10 @@ def _read(path: Path, way_out: str) -> dict[str, Tensor]:
 
 
 def _check_progress(values: Mapping[str, Any], update: int) -> None:
-    """Check the position of a run against the name of its folder.
+    """Check the position of a run against the name of the folder.
 
     Raises:
-        ValueError: It is of another update, or a number is missing or not finite.
+        ValueError: A position of a different update, or a number that is missing or not finite.
     """
     if type(values.get("update")) is not int or values["update"] != update:
         raise ValueError(f"its update is {str(values.get('update'))[:40]!r}, not {update}")
@@ -141,7 +141,7 @@ def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) 
     """Check that weights are those of a module, number for number.
 
     Raises:
-        ValueError: Another name, shape or dtype, or a weight that is not finite.
+        ValueError: A wrong name, shape or dtype, or a weight that is not finite.
     """
     state = module.state_dict()
     if state.keys() != weights.keys():
@@ -159,7 +159,7 @@ def _parse_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> dict[
     """State of an optimizer by number of the parameter.
 
     Raises:
-        ValueError: A moment of no parameter, of another shape, or not finite.
+        ValueError: A moment of no parameter, of a wrong shape, or not finite.
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}

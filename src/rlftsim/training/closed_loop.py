@@ -46,12 +46,12 @@ class ClosedLoopPrediction:
 def predict_targets(
     policy: TokenPolicy, context: Any, targeted: TargetedRollouts, trained: Bool[Tensor, "B A"]
 ) -> ClosedLoopPrediction:
-    """Predictions along rollouts: differentiable, one parallel pass.
+    """Predictions along rollouts: differentiable, in a single parallel pass.
 
     Args:
         policy: the policy that rolled out.
-        context: its encoding of the same scenarios.
-        targeted: the rollouts and their targets.
+        context: the policy's encoding of the same scenarios.
+        targeted: the rollouts with targets.
         trained: True = the agent's decisions count.
     """
     dist: TokenLogits = policy.score(context, targeted.rollouts)  # type: ignore[assignment]

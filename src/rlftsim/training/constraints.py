@@ -1,4 +1,4 @@
-"""Means that calibration keeps as they are, by name: the value in a scenario, and the credit of each agent for it.
+"""Means that calibration keeps unchanged, by name: the value in a scenario, and the credit of each agent for the value.
 
 B scenarios, N rollouts, A agents.
 """
@@ -31,9 +31,9 @@ class Constraint:
         return total.amin(1) if self.is_minimum else total.mean(1)
 
     def credit(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-        """What an agent's decisions in a rollout add to the value.
+        """Contribution of an agent's decisions in a rollout to the value.
 
-        Summed with their score functions over rollouts and agents it is an estimate of the value's gradient, without
+        Summed with score functions over rollouts and agents, credits are an estimate of the value's gradient, without
         bias where no agent's part depends on other agents.
         """
         if not self.is_minimum:
@@ -48,15 +48,15 @@ class Constraint:
 def subtract_baseline(added: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
     """Contributions of rollouts minus the mean of the other rollouts' contributions.
 
-    Where these depend on the rollout itself, as in `mloo`, its score function times the result is the gradient to first
-    order.
+    Where that mean depends on the rollout at hand, as in `mloo`, the score function of the rollout times the result is
+    the gradient to first order.
     """
     num_rollouts = added.shape[1]
     return (added - added.mean(1, keepdim=True)) * (num_rollouts / (num_rollouts - 1))
 
 
 def mean_speed(batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores) -> Float[Tensor, "B N A"]:
-    """Parts of the agents in their mean speed, m/s, over the steps that the log has."""
+    """Parts of the agents in the mean speed, m/s, over the steps that the log has."""
     speed, logged_valid = simulated_speeds(batch, rollouts)
     by_agent = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
     return _share(by_agent, logged_valid.any(-1))
@@ -70,12 +70,12 @@ def mean_evaluated_speed(batch: ScenarioBatch, rollouts: Rollouts, agents: Agent
 
 
 def displacement(batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores) -> Float[Tensor, "B N A"]:
-    """Parts of the evaluated agents in their displacement error, m."""
+    """Parts of the evaluated agents in the displacement error, m."""
     return agents.displacement_error.double()
 
 
 def _share(values: Float[Tensor, "B N A"], counts: Tensor) -> Float[Tensor, "B N A"]:
-    """Values of the agents that count over their number, 0 for others."""
+    """Values of the agents that count over the number of these agents; 0 for all other agents."""
     number = counts.sum(-1).clamp(min=1)[:, None, None]
     return torch.where(counts[:, None], values, 0.0) / number
 

@@ -13,7 +13,7 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.mirror import mirrored
+from rlftsim.scenario.mirror import mirror_scenario
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
 
 MIN_FUTURE_STEPS = 5
@@ -31,14 +31,14 @@ def batch_with_futures(
 
     Args:
         scenarios: Training scenarios, which the indices count.
-        indices: Indices of the scenarios of the batch, in its order.
-        context_radius_m: leave out steps farther from the ego, see `within_reach`; None = leave out nothing.
-        mirror: indices of those that are seen mirrored.
+        indices: Indices of the scenarios of the batch, in order.
+        context_radius_m: leave out steps farther from the ego, see `within_reach`; None = keep all steps.
+        mirror: indices of the scenarios that are seen mirrored.
 
     Raises:
-        DataError: one of them withholds its future, so nothing can be learned from it.
+        DataError: a scenario withholds the future, so the model cannot learn from the scenario.
     """
-    selected = [mirrored(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
+    selected = [mirror_scenario(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
     for scenario in selected:
         if not scenario.has_future:
             raise DataError(
@@ -51,17 +51,17 @@ def batch_with_futures(
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:
-    """A scenario in which a step of an agent is valid only if it is within a radius of the ego at that step.
+    """A scenario in which a step of an agent is valid only within a radius of the ego at that step.
 
-    An agent that is out of reach at the current step is not simulated. At steps where the ego is not valid
-    nothing is left out.
+    An agent that is out of reach at the current step is not simulated. At steps where the ego is not valid all agents
+    stay.
 
     Args:
         scenario: Scenario with any number of logged steps.
         radius_m: 3-D distance.
 
     Returns:
-        The same object as `scenario` where everything is within reach.
+        The same object as `scenario` where all steps are within reach.
     """
     return _without_far_steps(scenario, radius_m) or scenario
 
@@ -80,15 +80,15 @@ def _without_far_steps(scenario: Scenario, radius_m: float) -> Scenario | None:
 def trained_agents(
     batch: ScenarioBatch, update: int, *, radius_m: float, limit: int | None, seed: int
 ) -> Bool[Tensor, "B A"]:
-    """Agents whose predictions count: evaluated and interesting ones, then others near the ego, up to a limit.
+    """Agents whose predictions count: evaluated and interesting agents, then other agents near the ego, up to a limit.
 
-    The others need a logged future. Their draw depends on the seed, the update and the scenario, not on the rest of the
-    batch.
+    The other agents need a logged future. The draw depends on the seed, the update and the scenario, not on the rest of
+    the batch.
 
     Args:
-        batch: Scenarios with their logged futures.
+        batch: Scenarios with logged futures.
         update: counted from 0.
-        radius_m: distance from the ego at the current step up to which the others are taken.
+        radius_m: distance from the ego at the current step up to which other agents are taken.
         limit: Largest number of trained agents in a scenario; None = no limit.
         seed: Seed of the run; equal seeds, equal choices.
     """
@@ -118,7 +118,7 @@ def trained_agents(
 
 
 def mirrored_of_update(update: int, indices: Sequence[int], probability: float, seed: int) -> set[int]:
-    """The scenarios of an update that are seen mirrored; each draws for itself, so processes need not agree.
+    """The scenarios of an update that are seen mirrored; each scenario draws alone, so processes need not agree.
 
     Args:
         update: counted from 0.
@@ -130,7 +130,7 @@ def mirrored_of_update(update: int, indices: Sequence[int], probability: float, 
 
 
 def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: int) -> list[int]:
-    """Indices of the scenarios of an update: the data set in a new random order every epoch, nothing left out.
+    """Indices of the scenarios of an update: the whole data set in a new random order every epoch.
 
     Args:
         update: counted from 0.
@@ -149,10 +149,10 @@ def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: 
 
 
 def share_cache(scenarios: Scenarios, num_processes: int) -> Scenarios:
-    """Scenarios of which each process keeps its share in memory, where the process cannot keep all.
+    """Scenarios of which each process keeps a share in memory, where the process cannot keep all.
 
     Args:
-        scenarios: Training scenarios; a list, which is in memory already, stays as it is.
+        scenarios: Training scenarios; a list, which is in memory already, stays unchanged.
         num_processes: Processes that share a memory.
     """
     if not isinstance(scenarios, ScenarioDataset) or num_processes == 1:

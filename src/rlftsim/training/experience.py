@@ -1,4 +1,4 @@
-"""The experience of an update: rollouts of some scenarios, what they earn, and the metrics that are logged of it."""
+"""The experience of an update: rollouts of some scenarios, rewards, and the metrics that are logged."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
 
 @dataclass(frozen=True, eq=False)
 class Experience:
-    """Rollouts of some scenarios and what they earned."""
+    """Rollouts of some scenarios with rewards."""
 
     batch: ScenarioBatch
     rollouts: Rollouts
@@ -38,10 +38,10 @@ class Experience:
     """Rollouts that this process scores with gradient, where several have the same scenarios; None = all."""
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
-        """Yield this process's rollouts of every scenario with what each agent earned in them.
+        """Yield this process's rollouts of every scenario with each agent's rewards.
 
         Args:
-            size: rollouts of a scenario at a time, so that few are in memory with their gradient.
+            size: rollouts of a scenario at a time, so that few are in memory with gradients.
         """
         rollout_ids = self.rollout_ids or range(self.rollouts.num_rollouts)
         for start in rollout_ids[::size]:
@@ -68,12 +68,12 @@ def sample_rollouts(
 
     Args:
         policy: decides for all agents.
-        batch: scenarios with their futures.
-        goals: Settings of goals: probability of an agent to have one.
-        augmented: goals beside the logged endpoints, if there are any.
+        batch: scenarios with futures.
+        goals: Settings of goals: probability of an agent to have a goal.
+        augmented: goals beside the logged endpoints, if any.
         num_rollouts: N, of each scenario.
         rollout_ids: Rollouts that this process simulates; the rest comes from the processes with the same scenarios.
-        seed: Seed of the run; with `update` it determines goals and rollouts.
+        seed: Seed of the run; determines goals and rollouts together with `update`.
         update: Number of the update, from 0.
         fabric: precision of the pass, and the processes.
     """
@@ -95,9 +95,9 @@ def sample_rollouts(
 
 
 def _gather_rollouts(rollouts: Rollouts, num_rollouts: int, fabric: Fabric) -> Rollouts:
-    """All rollouts of the scenarios that several processes share, in their order and the same bits in each of them.
+    """All rollouts of the scenarios that several processes share, in order and with the same bits in each process.
 
-    Rewards compare the rollouts of a scenario with each other, so each process needs them all. They are small.
+    Rewards compare the rollouts of a scenario with each other, so each process needs all rollouts, which are small.
     """
     names = [field.name for field in fields(rollouts) if isinstance(getattr(rollouts, field.name), Tensor)]
     gathered = all_gather({name: getattr(rollouts, name) for name in names}, fabric)
@@ -110,12 +110,12 @@ def _gather_rollouts(rollouts: Rollouts, num_rollouts: int, fabric: Fabric) -> R
 
 
 def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
-    """Realism of rollouts and what they earn; a scenario without a map counts as on the road.
+    """Realism and rewards of rollouts; a scenario without a map counts as on the road.
 
-    The features that both are made of are measured once, however many terms the reward has.
+    The features behind both are measured once, however many terms the reward has.
 
     Args:
-        batch: scenarios with their futures.
+        batch: scenarios with futures.
         rollouts: N rollouts of each scenario, in the frame of the batch.
         config: reward, metric and credit assignment.
     """
@@ -128,14 +128,14 @@ def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneCon
 
 
 def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[Experience], float]:
-    """Rewards without the part that an agent's mean speed explains, so that being slow earns nothing by itself.
+    """Rewards without the part that an agent's mean speed explains, so that being slow earns no reward.
 
-    The part is a linear regression over all agents of the update, each compared with itself in the scenario's other
-    rollouts, in the steps that its log has. Slow cars collide less and stay on the road, so without this the realism
-    metric rewards driving slowly.
+    The part is a linear regression over all agents of the update, each compared with the same agent in the scenario's
+    other rollouts, in the steps that the agent's log has. Slow cars collide less and stay on the road, so without this
+    the realism metric rewards driving slowly.
 
     Args:
-        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        experiences: Rollouts of this process with rewards, an entry per micro batch.
         fabric: Processes of the run, over which sums are added.
 
     Returns:
@@ -163,10 +163,10 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
 
 
 def count_decisions(experiences: Sequence[Experience], fabric: Fabric) -> tuple[int, float]:
-    """Number of scenarios and of decisions in the whole batch, those of other processes included.
+    """Number of scenarios and of decisions in the whole batch, other processes included.
 
     Args:
-        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        experiences: Rollouts of this process with rewards, an entry per micro batch.
         fabric: Processes of the run, over which sums are added.
     """
     totals = torch.zeros(2, device=fabric.device, dtype=torch.float64)
@@ -184,12 +184,12 @@ def count_decisions(experiences: Sequence[Experience], fabric: Fabric) -> tuple[
 
 
 def describe(experiences: Sequence[Experience], fabric: Fabric) -> dict[str, float]:
-    """Metrics of an update: means over all scenarios, those of other processes included.
+    """Metrics of an update: means over all scenarios, other processes included.
 
     A scenario without a finite value is left out of that mean.
 
     Args:
-        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        experiences: Rollouts of this process with rewards, an entry per micro batch.
         fabric: Processes of the run, over which sums are added.
     """
     metrics = [describe_scenarios(experience) for experience in experiences]
@@ -252,7 +252,7 @@ def describe_goals(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
 
 
 def compute_diversity(rollouts: Rollouts) -> Float[Tensor, "B"]:
-    """Mean distance of an agent's final positions from their mean over rollouts, m."""
+    """Mean distance of an agent's final positions from the mean position over rollouts, m."""
     ends = rollouts.position[..., -1, :]  # [B, N, A, 2]
     spread = (ends - ends.mean(1, keepdim=True)).norm(dim=-1)  # [B, N, A]
     # Padding has positions, too: only agents that decide count.
@@ -264,7 +264,7 @@ def compute_speed_gap(batch: ScenarioBatch, rollouts: Rollouts) -> Float[Tensor,
     """Mean simulated speed minus mean logged speed, m/s, over the agents and steps that are valid in the log.
 
     Args:
-        batch: scenarios with their logged tracks.
+        batch: scenarios with logged tracks.
         rollouts: N rollouts of each scenario, in the frame of the batch.
 
     Returns:
@@ -281,7 +281,7 @@ def simulated_speeds(
     """Speeds of each step of the future, m/s, and 1 for the agents and steps that are valid in the log, else 0.
 
     Args:
-        batch: scenarios with their logged tracks.
+        batch: scenarios with logged tracks.
         rollouts: N rollouts of each scenario, in the frame of the batch.
     """
     future, valid = slice(CURRENT_STEP + 1, None), batch.valid

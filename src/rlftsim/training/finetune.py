@@ -1,6 +1,6 @@
 """Closed-loop fine-tuning with rewards: sample, reward, score, update, sync the reference (RLFTSim, section 4).
 
-The main path of this package; `update_policy` is one update of it, in seven steps.
+The main path of this package; `update_policy` is a single update, in seven steps.
 """
 
 import copy
@@ -60,7 +60,7 @@ class RewardMethod(Method[FinetuneConfig]):
         return prepare(policy, settings, fabric.device, augmented)
 
     def update(self, learner: RewardLearner, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
-        """One `update_policy`, with the messages that it gives rise to."""
+        """One `update_policy`, with the resulting messages."""
         config = learner.config
         values = update_policy(learner, scenarios.batch(config.num_rollouts), config, fabric)
         levels, alarms = learner.alarms.watch(values, config.alarms)
@@ -86,7 +86,7 @@ def prepare(
 
     Args:
         policy: Policy to train in place.
-        config: Settings of the run; a stored run resumes only with equal ones.
+        config: Settings of the run; a stored run resumes only with equal settings.
         device: Device to train on; the policy moves there.
         augmented: Stored goals beside the logged endpoints; None = endpoints alone.
     """
@@ -113,13 +113,13 @@ def prepare(
 def update_policy(
     learner: RewardLearner, batch: ScenarioBatch, config: FinetuneConfig, fabric: Fabric
 ) -> dict[str, float]:
-    """Make one update of the policy, as in RLFTSim, section 4.1.
+    """Make an update of the policy, as in RLFTSim, section 4.1.
 
     Args:
         learner: Policy, reference and counters, changed in place.
-        batch: this process's scenarios of the update, with their futures.
-        config: Settings of the run; a stored run resumes only with equal ones.
-        fabric: Processes of the run, and the precision of its passes.
+        batch: this process's scenarios of the update, with futures.
+        config: Settings of the run; a stored run resumes only with equal settings.
+        fabric: Processes of the run, and the precision of passes.
 
     Returns:
         Metrics by the names of metrics.jsonl.

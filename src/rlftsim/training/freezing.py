@@ -1,4 +1,4 @@
-"""The weights that a training method trains, and their learning rates."""
+"""The weights that a training method trains, and the learning rates."""
 
 import copy
 from typing import Any, Literal
@@ -21,9 +21,9 @@ def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[
 
     Args:
         policy: Policy that may name its modules for fine-tuning.
-        trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, all of it where it names none.
-            "head" = what it names in `head_modules`, its last layers. "goals" = the goal encoder only, so that agents
-            without a goal go on deciding as before. "all" = everything.
+        trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, the whole policy where no modules
+            are named. "head" = the last layers, which the policy names in `head_modules`. "goals" = the goal encoder
+            only, so that agents without a goal go on deciding as before. "all" = the whole policy.
 
     Raises:
         ConfigError: the policy is not goal-conditioned, has no part that only goals use, or names no head.
@@ -47,7 +47,7 @@ def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[
 
 
 def freeze_untrained(policy: nn.Module, trained: TrainedModules) -> None:
-    """Require a gradient of the weights that are trained, and of no others.
+    """Require a gradient of the weights that are trained, and of no other weights.
 
     Args:
         policy: Policy whose weights are frozen or released in place.
@@ -64,7 +64,7 @@ def freeze_untrained(policy: nn.Module, trained: TrainedModules) -> None:
 
 
 def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules) -> None:
-    """Refuse an entropy bonus for a policy whose entropy no trained weight moves, such as one with fixed noise.
+    """Refuse an entropy bonus for a policy with an entropy that no trained weight moves, such as one with fixed noise.
 
     Args:
         policy: Policy to try, of which a copy decides.
@@ -72,7 +72,7 @@ def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules
         trained: see `select_trained_modules`.
 
     Raises:
-        ConfigError: the entropy of its decisions has no gradient.
+        ConfigError: the entropy of the decisions has no gradient.
     """
     tried: Any = copy.deepcopy(policy).eval()
     freeze_untrained(tried, trained)
@@ -87,11 +87,11 @@ def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules
 
 
 def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]]:
-    """The weights that require a gradient, as groups for an optimizer: the goal encoder apart from all others.
+    """The weights that require a gradient, as groups for an optimizer: the goal encoder apart from all other weights.
 
     Args:
         model: Model whose untrained weights `freeze_untrained` has frozen.
-        goal_scale: learning rate of the goal encoder over that of the others.
+        goal_scale: learning rate of the goal encoder over the rate of all other weights.
     """
     goal_weights = [p for module in _goal_modules(model) for p in module.parameters() if p.requires_grad]
     # By identity: comparing tensors would compare their values.
@@ -110,7 +110,7 @@ def set_learning_rate(optimizer: Optimizer, value: float) -> None:
     """Set the learning rate of the next step.
 
     Args:
-        optimizer: its groups may have a "scale", see `parameter_groups`; it is 1 where they have none.
+        optimizer: Groups may have a "scale", see `parameter_groups`; the default is 1.
         value: learning rate of a group with scale 1.
     """
     for group in optimizer.param_groups:

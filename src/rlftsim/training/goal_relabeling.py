@@ -1,12 +1,12 @@
-"""Goal relabelling (gcsl): train the goal encoder on the policy's own rollouts, relabelled with their endpoints.
+"""Goal relabelling (gcsl): train the goal encoder on the policy's own rollouts, relabelled with endpoints.
 
-Every rollout gets somewhere. Its endpoints become the goals of its agents, and the goal encoder learns to predict
-what was decided: p(token | state, endpoint). Nothing else is trained, so agents without a goal go on deciding as
-before, and every rollout is an example. Done before fine-tuning with a reward, it makes that begin with agents
-that follow goals already.
+Every rollout gets somewhere. The endpoints become the goals of the agents, and the goal encoder learns to predict the
+decisions: p(token | state, endpoint). No other weights are trained, so agents without a goal go on deciding as before,
+and every rollout is an example. Fine-tuning with a reward that starts from a relabelled policy begins with agents that
+follow goals already.
 
-Source: after Ghosh et al., "Learning to Reach Goals via Iterated Supervised Learning", 2021. Here it is one round: the
-rollouts are goal-free ones.
+Source: after Ghosh et al., "Learning to Reach Goals via Iterated Supervised Learning", 2021. Here the method is a
+single round, with goal-free rollouts.
 """
 
 from dataclasses import dataclass, replace
@@ -80,7 +80,7 @@ class GcslMethod(ImitationMethod[GcslConfig]):
         return super().start(policy, scenarios, settings, fabric)
 
     def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
-        """Predictions along the policy's rollouts, whose endpoints are the goals."""
+        """Predictions along the policy's rollouts, with endpoints as goals."""
         model, config = learner.policy, learner.config
         model.eval()  # nothing that dropout would act on is trained
         context = model.encode(batch)
@@ -96,7 +96,7 @@ class GcslMethod(ImitationMethod[GcslConfig]):
 
 
 def relabel_with_endpoints(rollouts: Rollouts) -> Rollouts:
-    """The same rollouts, with each agent's final position as its goal."""
+    """The same rollouts, with each agent's final position as the goal."""
     # Agents that decide nothing are padding and have no endpoint.
     decides = rollouts.decision_mask.any(-1)  # [B, N, A]
     return replace(rollouts, goals=Goals(rollouts.position[..., -1, :], decides))

@@ -68,12 +68,12 @@ class GoalConfig:
 
 
 def with_goals(config: GoalConfig) -> GoalConfig:
-    """The same settings, with goals for all agents and with hindsight where they were off."""
+    """The same settings, with goals for all agents and hindsight, each where off so far."""
     return replace(config, probability=config.probability or 1.0, hindsight=config.hindsight or 1.0)
 
 
 def check_goals(policy: Policy, probability: float) -> None:
-    """Refuse to train a policy with goals if it is not goal-conditioned.
+    """Refuse to train a policy with goals unless goal-conditioned.
 
     Args:
         policy: Policy that a run is going to train.
@@ -94,10 +94,10 @@ def not_conditioned(policy: object) -> str:
 
 
 def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoals | None, *, seed: int) -> Goals | None:
-    """Goals of a batch in one update, with N = 1: all rollouts of a scenario have the same.
+    """Goals of a batch in one update, with N = 1: all rollouts of a scenario have the same goals.
 
     Args:
-        batch: Scenarios with their logged futures.
+        batch: Scenarios with logged futures.
         config: Probabilities of goals and of augmented goals.
         augmented: Stored goals beside the logged endpoints; None = endpoints alone.
         seed: Seed of the update; the goals of a scenario do not depend on the rest of the batch.

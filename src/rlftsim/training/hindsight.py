@@ -1,9 +1,9 @@
-"""Hindsight within an update of fine-tuning: rollouts are relabelled with goals that one of them has met.
+"""Hindsight within an update of fine-tuning: rollouts are relabelled with goals that the most realistic one met.
 
-Reaching a goal may be too rare to learn from, but every rollout gets somewhere. So the rollouts of a scenario are
-used a second time, as if their goals had been the endpoints of the most realistic one. They were sampled under
-other goals, so what an agent's decisions earn is weighted by the importance ratio, their probability under the
-new goals over that under the old ones.
+Reaching a goal may be too rare to learn from, but every rollout gets somewhere. So the rollouts of a scenario are used
+a second time, as if the goals had been the endpoints of the most realistic rollout. The rollouts were sampled under
+other goals, so the reward of an agent's decisions is weighted by the importance ratio, the decisions' probability under
+the new goals over the probability under the old goals.
 
 Sources: Rauber et al., "Hindsight policy gradients", 2019; RLFTSim, section 4.2. `training.augment` uses the same idea
 before training.
@@ -34,14 +34,14 @@ LARGEST_RATIO = 10.0
 
 
 def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Experience]:
-    """The rollouts as if sampled under goals that the most realistic one has met, and what they earn by that.
+    """The rollouts as if sampled under goals that the most realistic rollout has met, and the resulting rewards.
 
-    Only the reward's goal terms count: realism does not depend on goals and was rewarded before. Each agent earns
-    its own part, because each agent's decisions have an importance ratio of their own.
+    Only the reward's goal terms count: realism does not depend on goals and was rewarded before. Each agent earns a
+    separate part, because each agent's decisions have a separate importance ratio.
 
     Args:
-        experiences: Rollouts of this process with their rewards, an entry per micro batch.
-        terms: Terms of the run's reward, of which those with goals count.
+        experiences: Rollouts of this process with rewards, an entry per micro batch.
+        terms: Terms of the run's reward, of which only goal terms count.
     """
     relabelled = []
     for experience in experiences:
@@ -70,7 +70,7 @@ def met_goals(rollouts: Rollouts, realism: RealismResult) -> Goals:
 
 
 def importance_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-    """Probability of each agent's decisions under new goals over that under old ones; clipped, without gradient.
+    """Probability of each agent's decisions under new goals over the probability under old goals; clipped, no gradient.
 
     Args:
         new: Log-probability of all of an agent's decisions under the new goals, nats.
@@ -91,11 +91,11 @@ def accumulate_hindsight(
     weight: float,
     rollouts_per_pass: int,
 ) -> dict[str, float]:
-    """Add the gradient of what the rollouts earn under hindsight's goals to the policy's parameters.
+    """Add the gradient of the rewards under hindsight's goals to the policy's parameters.
 
     Args:
         policy: scores the relabelled rollouts.
-        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        experiences: Rollouts of this process with rewards, an entry per micro batch.
         reward: terms of the run's reward.
         first_pass: has the log-probabilities under the old goals.
         terms: reduction and counts of the update.

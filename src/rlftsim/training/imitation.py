@@ -1,8 +1,8 @@
 """Learning by imitation: the update that pre-training, CAT-K and goal relabelling share.
 
-They differ in the trajectories along which a model predicts tokens: the logged tracks (pre-training), CAT-K
-rollouts, or the policy's own rollouts. The loss is the cross-entropy of the target tokens, or one that the policy
-brings (`ImitatedPolicy`); its sum over everything that an update sees is divided by the number of predictions.
+The methods differ in the trajectories along which a model predicts tokens: the logged tracks (pre-training), CAT-K
+rollouts, or the policy's own rollouts. The loss is the cross-entropy of the target tokens, or a loss that the policy
+brings (`ImitatedPolicy`); the sum over all scenarios of an update is divided by the number of predictions.
 """
 
 import copy
@@ -126,7 +126,7 @@ class ImitationConfig:
 
 @dataclass(eq=False, kw_only=True)
 class Imitator(Learner):
-    """A model in training, with what its updates are made of."""
+    """A model in training, with the state that updates need."""
 
     num_scenarios: int
     """Training scenarios, all of them."""
@@ -137,13 +137,13 @@ class Imitator(Learner):
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Model, average and frozen policy, as far as they exist."""
+        """Model, average and frozen policy, as far as present."""
         further = {"average": self.average, "frozen": self.frozen}
         return {**super().modules, **{name: module for name, module in further.items() if module is not None}}
 
     @property
     def result(self) -> Any:
-        """The average, if there is one."""
+        """The average, if there is an average."""
         return self.policy if self.average is None else self.average
 
     def finish_update(self, *, is_good: bool) -> None:
@@ -165,7 +165,7 @@ Config = TypeVar("Config", bound=ImitationConfig)
 
 
 class ImitationMethod(Method[Config]):
-    """Base of methods that learn by imitation: a method brings `predict`, and its checks in `start`."""
+    """Base of methods that learn by imitation: a method brings `predict`, and checks in `start`."""
 
     validates = True
 
@@ -202,13 +202,13 @@ class ImitationMethod(Method[Config]):
 
         Args:
             learner: Model and settings; the update is `learner.update`.
-            batch: Scenarios with their futures.
+            batch: Scenarios with futures.
             trained: True = the agent's predictions count.
         """
         raise NotImplementedError
 
     def update(self, learner: Imitator, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
-        """One optimizer step along the trajectories of the method."""
+        """An optimizer step along the trajectories of the method."""
         start = time.perf_counter()
         values = update_imitator(learner, scenarios, partial(self.predict, learner), fabric)
         values["seconds"] = time.perf_counter() - start
@@ -258,12 +258,12 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
 def update_imitator(
     learner: Imitator, scenarios: UpdateScenarios, predict: Predict, fabric: Fabric
 ) -> dict[str, float]:
-    """Metrics of one optimizer step: sums of losses over micro batches and processes, over the number of predictions.
+    """Metrics of an optimizer step: sums of losses over micro batches and processes, over the number of predictions.
 
     Args:
         learner: Model and settings, changed in place.
         scenarios: Scenarios of the update that this process works on.
-        predict: Predictions of a batch for the agents that count, or their loss.
+        predict: Predictions of a batch for the agents that count, or the loss.
         fabric: Precision of the passes, and processes that sums are added over.
     """
     config, update = learner.config, learner.update
@@ -314,11 +314,11 @@ def update_imitator(
 def loss_along_log(
     model: Any, batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int
 ) -> Prediction | ImitationLoss:
-    """The model's own imitation loss, or its predictions of the next token along logged tracks.
+    """The model's own imitation loss, or predictions of the next token along logged tracks.
 
     Args:
-        model: PretrainablePolicy or ImitatedPolicy, whose own loss goes first.
-        batch: Scenarios with their logged futures.
+        model: PretrainablePolicy or ImitatedPolicy; the loss of an ImitatedPolicy goes first.
+        batch: Scenarios with logged futures.
         trained: True = the agent's predictions count.
         update: Number of the update, from 0; draws of an own loss depend on it.
     """
@@ -329,18 +329,18 @@ def loss_along_log(
 def accumulate_imitation(
     model: Any, batches: Sequence[ScenarioBatch], weight: float, fabric: Fabric, *, update: int, seed: int
 ) -> float:
-    """Set the model's gradient to that of `weight` times the mean pre-training loss along the log.
+    """Set the model's gradient to the gradient of `weight` times the mean pre-training loss along the log.
 
-    Goes before anything else that adds to the gradient: the mean is over the predictions of all processes, whose number
-    is known only when all have been made, so what was accumulated is scaled at the end.
+    Goes before all other additions to the gradient: the mean is over the predictions of all processes, the number of
+    which is known only at the end, so the accumulated gradient is scaled then.
 
     Args:
         model: Model with zero gradients, as `loss_along_log` takes it.
-        batches: this process's scenarios, with their futures; all agents with a future count.
+        batches: this process's scenarios, with futures; all agents with a future count.
         weight: Weight of the loss in the objective.
         fabric: precision, and the processes that the mean is over.
         update: Number of the update, from 0.
-        seed: Seed of the draws of an own loss; with update and process it determines them.
+        seed: Seed of the draws of an own loss; determines the draws together with update and process.
 
     Returns:
         The mean loss, nats per prediction for policies over tokens.
@@ -365,17 +365,19 @@ def accumulate_imitation(
 def summed_loss(
     prediction: Prediction, label_smoothing: float, nearby: Vocabulary | None = None, still_weight: float = 1.0
 ) -> ImitationLoss:
-    """Cross-entropy of tokens summed over predictions, nats, with what its metrics are made of.
+    """Cross-entropy of tokens summed over predictions, nats, with the sums for metrics.
 
     Args:
-        prediction: logits and targets; only what the target mask marks counts.
+        prediction: logits and targets; only entries marked by the target mask count.
         label_smoothing: probability that the target gives to other tokens.
-        nearby: vocabulary whose tokens near the target get it; None = all tokens that exist, the target among them.
-        still_weight: weight of predictions whose target is token 0, which stands still in a vocabulary; others count 1.
+        nearby: vocabulary whose tokens near the target get that probability; None = all tokens that exist, the target
+            included.
+        still_weight: weight of predictions whose target is token 0, which stands still in a vocabulary; all other
+            predictions count 1.
 
     Returns:
         The loss and the number of predictions; the top-1 hits, the top-5 hits and the entropy (nats) by the names of
-        their means. All are sums over predictions times their weights, and zero where nothing counts.
+        the means. All are sums over predictions times weights, and zero where no prediction counts.
     """
     logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]  # [r, V], [r]
     log_probs = functional.log_softmax(logits, -1)

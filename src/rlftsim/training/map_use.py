@@ -1,7 +1,7 @@
 """Map use: the nats that a model's predictions of logged tokens lose when the whole map is moved far away.
 
-A model with a low loss may still not read the map: most tokens go straight on or stand still, and history alone
-predicts them. Turning tokens tell. Vehicles only, as they are the ones that follow lanes.
+A model with a low loss may still not read the map: most tokens go straight on or stand still, which history alone
+predicts. Turning tokens tell. Vehicles only, since vehicles follow lanes.
 """
 
 from dataclasses import dataclass, replace
@@ -55,7 +55,7 @@ class MapUse:
 
 
 def predicts_tokens(policy: object) -> bool:
-    """True for a policy whose map use can be measured: it predicts the tokens of a vocabulary along logged tracks."""
+    """True for a policy with measurable map use: predictions of the tokens of a vocabulary along logged tracks."""
     return isinstance(policy, PretrainablePolicy) and isinstance(getattr(policy, "vocabulary", None), Vocabulary)
 
 
@@ -65,7 +65,7 @@ def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
 
     Args:
         policy: Policy with a vocabulary, in evaluation mode.
-        batch: Scenarios with their futures, on the policy's device.
+        batch: Scenarios with futures, on the policy's device.
     """
     shifted = []
     for scenario in batch.scenarios:

@@ -19,7 +19,6 @@ from torch import nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
-from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.batches import check_scored, micro_batches, scenario_costs
@@ -29,7 +28,7 @@ from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices, num_s
 
 @runtime_checkable
 class TrainingSettings(Protocol):
-    """Settings that every training method has: a frozen dataclass of them is stored with a run, and becomes flags."""
+    """Settings that every training method has: a frozen dataclass is stored with a run, and becomes flags."""
 
     @property
     def batch_size(self) -> int:
@@ -76,7 +75,7 @@ Settings = TypeVar("Settings", bound=TrainingSettings)
 
 @dataclass(eq=False, kw_only=True)
 class Learner:
-    """The state of a run that changes from update to update, which its checkpoints hold."""
+    """The state of a run that changes from update to update, which checkpoints hold."""
 
     policy: Any
     optimizer: Optimizer
@@ -101,7 +100,7 @@ class Learner:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Modules that a checkpoint holds, by their file name."""
+        """Modules that a checkpoint holds, by file name."""
         return {"policy": self.policy}
 
     @property
@@ -117,10 +116,10 @@ class Learner:
         """Take back the numbers of a checkpoint."""
 
     def finish(self) -> None:
-        """Make the result of what was learned, where the updates alone do not."""
+        """Make the result from the learned state, where the updates alone do not."""
 
     def finish_update(self, *, is_good: bool) -> None:
-        """Take the optimizer's step, or skip it, and count the update either way.
+        """Take or skip the optimizer's step, and count the update either way.
 
         Args:
             is_good: False = the gradient cannot be used; weights and moments stay.
@@ -135,7 +134,7 @@ class Learner:
 
 @dataclass(frozen=True, eq=False)
 class UpdateReport:
-    """The outcome of one update."""
+    """The outcome of an update."""
 
     values: dict[str, float]
     """Metrics by the names of metrics.jsonl."""
@@ -149,7 +148,7 @@ class UpdateReport:
 
 @dataclass(frozen=True, eq=False)
 class UpdateScenarios:
-    """Scenarios of a learner's next update that this process works on; read when a batch of them is requested."""
+    """Scenarios of a learner's next update that this process works on; read when a batch is requested."""
 
     scenarios: Scenarios
     """All training scenarios."""
@@ -166,7 +165,7 @@ class UpdateScenarios:
         """Indices of the scenarios of this process: a share of about equal cost.
 
         Args:
-            num_rollouts: Rollouts of each scenario, which processes that outnumber the scenarios divide among them.
+            num_rollouts: Rollouts of each scenario, which processes that outnumber the scenarios divide.
         """
         selected = scenarios_of_update(
             self.learner.update, self.settings.batch_size, len(self.scenarios), self.settings.seed
@@ -176,7 +175,7 @@ class UpdateScenarios:
         return local_indices(selected, self.fabric, costs, num_rollouts=num_rollouts)
 
     def batch(self, num_rollouts: int = 1) -> ScenarioBatch:
-        """All scenarios of this process as one batch on its device, with their futures.
+        """All scenarios of this process as a batch on the process's device, with futures.
 
         Args:
             num_rollouts: Rollouts of each scenario, as in `indices`.
@@ -191,7 +190,7 @@ class UpdateScenarios:
         context_radius_m: float | None = None,
         mirror_probability: float = 0.0,
     ) -> Iterator[ScenarioBatch]:
-        """Yield the scenarios of this process in batches that fit into memory, each read when its turn comes.
+        """Yield the scenarios of this process in batches that fit into memory, each read when due.
 
         Args:
             max_count: Scenarios of a batch at most, divided among processes that share a memory.
@@ -210,7 +209,7 @@ class UpdateScenarios:
 
 @runtime_checkable
 class Method(Protocol[Settings]):
-    """A way to train a policy. A class that extends this one inherits `describe` and `validates`."""
+    """A way to train a policy. A subclass inherits `describe` and `validates`."""
 
     settings: type[Settings]
     """Dataclass of the method's settings, all with defaults. The type of the settings says which method trains."""
@@ -220,7 +219,7 @@ class Method(Protocol[Settings]):
     """True = the settings have a section `validation`, and held-out scenarios may be validated on."""
 
     def describe(self, settings: Settings) -> str:
-        """The method in a few words, for the README of its models."""
+        """The method in a few words, for the README of trained models."""
         return self.title
 
     def start(self, policy: Any, scenarios: Scenarios, settings: Settings, fabric: Fabric) -> Learner:
@@ -229,8 +228,8 @@ class Method(Protocol[Settings]):
         Called in each process, before the folder of the run is touched; `check_trainable` has the usual checks.
 
         Args:
-            policy: Policy to train in place; its weights may be on another device than that of `fabric`.
-            scenarios: All training scenarios, at least their index; reading each of them would take minutes.
+            policy: Policy to train in place; the weights may be on a different device than `fabric`.
+            scenarios: All training scenarios, at least the index; reading each scenario would take minutes.
             settings: Settings of the run.
             fabric: Device, precision and processes.
 
@@ -241,7 +240,7 @@ class Method(Protocol[Settings]):
         ...
 
     def update(self, learner: Learner, scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
-        """Make one update, which ends with `learner.finish_update`.
+        """Make an update, which ends with `learner.finish_update`.
 
         Args:
             learner: Result of `start`, changed in place; `learner.update` counts from 0.
@@ -249,46 +248,6 @@ class Method(Protocol[Settings]):
             fabric: Device, precision and processes; sums have to be added over the processes (`training.parallel`).
         """
         ...
-
-
-SHIPPED = {
-    "rlft": "rlftsim.training.finetune:RewardMethod",
-    "catk": "rlftsim.training.catk:CatkMethod",
-    "road": "rlftsim.training.catk:RoadMethod",
-    "gcsl": "rlftsim.training.goal_relabeling:GcslMethod",
-    "calibrate": "rlftsim.training.calibrate:CalibrateMethod",
-    "pretrain": "rlftsim.training.imitation:PretrainMethod",
-}
-"""Methods of this package, name to "module:class"."""
-METHODS: ExtensionPoint[type[Method[Any]]] = ExtensionPoint(
-    "method", "rlftsim.methods", SHIPPED, use=lambda name: method_by_name(name)
-)
-"""Training methods by name."""
-
-
-def method_by_name(name: str) -> Method[Any]:
-    """The training method of a name, installed packages included.
-
-    Raises:
-        ConfigError: Unknown, with the nearest registered name; or no training method.
-    """
-    method = METHODS.get(name)
-    missing = [member for member in ("settings", "title", "start", "update") if not hasattr(method, member)]
-    if missing:
-        raise ConfigError(
-            f"method {name!r} has no {' and no '.join(missing)}: make it extend rlftsim.training.method.Method."
-        )
-    return method()
-
-
-def find_method(settings: object) -> Method[Any] | None:
-    """The training method of settings, by their type; None where they are settings of no method."""
-    # Methods of other packages come last: a look at them imports all these packages.
-    for list_names in (lambda: list(SHIPPED), METHODS.names):
-        for name in list_names():
-            if getattr(METHODS.get(name), "settings", None) is type(settings):
-                return method_by_name(name)
-    return None
 
 
 def check_trainable(
@@ -307,7 +266,7 @@ def check_trainable(
         scenarios: Training scenarios, at least one.
         method: Name of the training method in messages, such as "CAT-K".
         needs: Further attributes that the method uses, such as "vocabulary".
-        is_imitated: True = the method uses the pre-training loss; one of the two ways to define it is enough.
+        is_imitated: True = the method uses the pre-training loss; either way to define the loss is enough.
         is_rewarded: True = the method scores rollouts of every scenario.
 
     Raises:

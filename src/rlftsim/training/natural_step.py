@@ -1,4 +1,4 @@
-"""One natural-gradient step of a few weights that leaves some means as they are, and how long it may be.
+"""A natural-gradient step of a few weights that leaves some means unchanged, and the best length of the step.
 
 S scenarios, K weights, C constrained means, X lengths.
 """
@@ -17,12 +17,12 @@ Vector = Float64[np.ndarray, "K"]
 def natural_direction(
     gradient: Vector, fisher: Float64[np.ndarray, "K K"], fixed: Float64[np.ndarray, "C K"], kl: float
 ) -> Vector:
-    """Direction of the largest gain per KL, of those in which the predicted change of the fixed means is 0.
+    """Direction of the largest gain per KL, among directions with a predicted change of 0 in the fixed means.
 
     Args:
         gradient: Gradient [K] of the objective by the weights.
-        fisher: Covariance of the score function, per decision. A weight without any stays 0.
-        fixed: Gradients of means that are to stay as they are.
+        fisher: Covariance of the score function, per decision. A weight without covariance stays 0.
+        fixed: Gradients of means that are to stay unchanged.
         kl: Predicted KL of the result, ½ e·F e, nats per decision.
 
     Returns:
@@ -46,7 +46,7 @@ def natural_direction(
 
 
 def best_length(lengths: Sequence[float], gains: Float64[np.ndarray, "S X"]) -> float:
-    """Length with the greatest gain on the parabola through 0 that fits measured gains best, at most the longest one.
+    """Length with the greatest gain on the parabola through 0 that fits measured gains best, up to the longest length.
 
     Args:
         lengths: Lengths that were tried, above 0.
@@ -61,6 +61,6 @@ def best_length(lengths: Sequence[float], gains: Float64[np.ndarray, "S X"]) -> 
 
 
 def t_value(values: Float64[np.ndarray, "S"]) -> float:
-    """Mean of some scenarios over its standard error; 0 where all are equal or there is one."""
+    """Mean of some scenarios over its standard error; 0 where all are equal, or for a single scenario."""
     spread = values.std(ddof=1) if len(values) > 1 else 0.0
     return float(values.mean() / (spread / np.sqrt(len(values)))) if spread > 0 else 0.0

@@ -1,8 +1,8 @@
 """Devices and processes.
 
-Every process works on its part of the global batch and adds up *sums*; the sums are added over the processes and
-divided by global counts. So the estimator is that of one process with the same global batch, no matter how
-scenarios and agents are spread.
+Every process works on a part of the global batch and adds up *sums*; the sums are added over the processes and divided
+by global counts. So the estimator equals that of a single process with the same global batch, no matter how scenarios
+and agents are spread.
 
 On GPUs and under torchrun, lightning-fabric connects the processes; on a CPU see `training.processes`.
 """
@@ -108,8 +108,8 @@ class DeviceConfig:
         """Processes of a run on this machine; the number that "auto" stands for.
 
         Args:
-            num_scenarios: Number of scenarios in the data set; few are trained on by one process.
-            batch_size: scenarios of an update; each process needs one.
+            num_scenarios: Number of scenarios in the data set; few are trained on by a single process.
+            batch_size: scenarios of an update; each process needs a scenario.
             micro_batch_size: scenarios in memory at once, which the processes on a CPU share.
             begun_with: number of a run that is resumed.
         """
@@ -125,15 +125,15 @@ class DeviceConfig:
 
 
 def can_fork() -> bool:
-    """True where training may start processes by forking this one.
+    """True where training may start processes by forking this process.
 
-    Elsewhere system libraries, or torch's threads for the backward pass on a GPU, do not survive it.
+    Elsewhere system libraries, or torch's threads for the backward pass on a GPU, do not survive a fork.
     """
     return sys.platform == "linux" and not torch.cuda.is_available() and not multiprocessing.current_process().daemon
 
 
 def start_fabric(config: DeviceConfig) -> Fabric:
-    """Device and precision of a run, and its processes on GPUs or under torchrun; for a CPU's see `linked_processes`.
+    """Device and precision of a run, and processes on GPUs or under torchrun; for a CPU's see `linked_processes`.
 
     Raises:
         ConfigError: CUDA is requested, but there is none.
@@ -169,7 +169,7 @@ def is_torchrun() -> bool:
 
 
 def is_first_process() -> bool:
-    """True for the process of rank 0, or the only one: the one that writes."""
+    """True for the process of rank 0, or the only process: the process that writes."""
     several = torch.distributed.is_available() and torch.distributed.is_initialized()
     return not several or torch.distributed.get_rank() == 0
 
@@ -177,7 +177,7 @@ def is_first_process() -> bool:
 def local_indices(
     items: list[int], fabric: Fabric, costs: Sequence[float] | None = None, *, num_rollouts: int = 1
 ) -> list[int]:
-    """This process's part of a global batch. Of fewer scenarios than processes, several processes have the same one.
+    """This process's part of a global batch. With fewer scenarios than processes, several share a scenario.
 
     Args:
         items: Indices of the scenarios of the global batch.
@@ -186,7 +186,7 @@ def local_indices(
         num_rollouts: Rollouts of each item, which processes in excess divide, see `local_rollouts`.
 
     Raises:
-        ConfigError: the processes cannot divide the scenarios, nor their rollouts, evenly.
+        ConfigError: the processes cannot divide the scenarios, nor the rollouts, evenly.
     """
     sharing = _num_sharing_scenario(len(items), num_rollouts, fabric)
     groups = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size // sharing)
@@ -195,7 +195,7 @@ def local_indices(
 
 
 def local_rollouts(num_items: int, num_rollouts: int, fabric: Fabric) -> range:
-    """Rollouts of its scenarios that this process simulates and scores: all, or a part where several share a scenario.
+    """Rollouts of each scenario that this process simulates and scores: all, or a part where processes share them.
 
     Args:
         num_items: Number of scenarios in the global batch.
@@ -211,7 +211,7 @@ def local_rollouts(num_items: int, num_rollouts: int, fabric: Fabric) -> range:
 
 
 def _num_sharing_scenario(num_items: int, num_rollouts: int, fabric: Fabric) -> int:
-    """Processes that have the same scenario and divide its rollouts: 1 if there are enough scenarios for all."""
+    """Processes that have the same scenario and divide the rollouts: 1 if there are enough scenarios for all."""
     if fabric.world_size <= num_items:
         return 1
     possible = [num_items * count for count in range(2, num_rollouts + 1) if num_rollouts % count == 0]
@@ -225,7 +225,7 @@ def _num_sharing_scenario(num_items: int, num_rollouts: int, fabric: Fabric) -> 
 
 
 def num_sharing_memory(fabric: Fabric) -> int:
-    """Number of processes that have one memory: all on a machine's CPU; each GPU has its own."""
+    """Number of processes that share a memory: all on a machine's CPU; a single process on a GPU."""
     if fabric.device.type != "cpu":
         return 1
     return int(os.environ["LOCAL_WORLD_SIZE"]) if is_torchrun() else fabric.world_size
@@ -265,7 +265,7 @@ def all_gather(tensors: Mapping[str, Tensor], fabric: Fabric) -> list[dict[str, 
 
 
 def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> None:
-    """Sum every gradient over all processes, in place, as one message.
+    """Sum every gradient over all processes, in place, as a single message.
 
     Args:
         parameters: Parameters in the same order in every process; without a gradient here a parameter adds zero.

@@ -1,9 +1,9 @@
 """REINFORCE with a reward per rollout (or agent) and a KL penalty, as arithmetic on sums.
 
 Every term is a sum over the agents and decisions of this process and slice, divided by a global count. So slices of the
-rollouts, micro batches and processes add up to one and the same estimator.
+rollouts, micro batches and processes add up to the same estimator.
 
-Source: RLFTSim, section 4.1; the adaptive penalty is that of Ziegler et al., "Fine-Tuning Language Models from Human
+Source: RLFTSim, section 4.1; the adaptive penalty is from Ziegler et al., "Fine-Tuning Language Models from Human
 Preferences", 2020.
 """
 
@@ -25,12 +25,12 @@ from rlftsim.training.parallel import Fabric, all_reduce_sum
 def agent_log_prob(
     log_prob: Float[Tensor, "B N A L"], mask: Bool[Tensor, "B N A L"], reduction: Reduction
 ) -> Float[Tensor, "B N A"]:
-    """Each agent's part of the log-probability of its rollout; summed over agents they are the rollout's.
+    """Each agent's part of the log-probability of a rollout; the sum over agents is the rollout's.
 
     Args:
         log_prob: Log-probability of each decision, nats.
         mask: True = the decision counts.
-        reduction: "sum" over all decisions of the rollout, or their "mean": the sum over L decisions of each agent that
+        reduction: "sum" over all decisions of the rollout, or the "mean": the sum over L decisions of each agent that
             decides at all.
     """
     total = torch.where(mask, log_prob, 0.0).sum(-1)  # [B, N, A]
@@ -46,7 +46,7 @@ def policy_gradient_loss(
     """Loss whose gradient is minus the policy gradient: - 1/B sum_b sum_i R[b, i] log pi(rollout i of b).
 
     Args:
-        reward: Reward of each rollout, or of each agent in a rollout, minus its baseline; a constant of the gradient.
+        reward: Reward of each rollout, or of each agent in a rollout, minus the baseline; a constant of the gradient.
         log_prob: Log-probability of the same rollouts or agents, nats.
         num_scenarios: B, over all slices and processes.
     """
@@ -66,7 +66,7 @@ def masked_sum(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) ->
 
 @dataclass(frozen=True)
 class LossTerms:
-    """Coefficients of the fine-tuning loss in one update, and the global counts that its sums are divided by."""
+    """Coefficients of the fine-tuning loss in one update, and the global counts that sums are divided by."""
 
     num_scenarios: int
     num_decisions: float
@@ -80,7 +80,7 @@ class LossTerms:
 
 @dataclass(frozen=True, eq=False)
 class GradientSums:
-    """Statistics of a pass over the rollouts, beside the gradients that it leaves in the parameters."""
+    """Statistics of a pass over the rollouts, beside the gradients that the pass leaves in the parameters."""
 
     kl: float
     """From the reference, nats per decision; mean over all processes."""
@@ -110,11 +110,11 @@ def accumulate_gradients(
     policy_gradient_loss + (beta * KL - entropy_bonus * entropy) / decisions + imitation_weight * pre-training loss.
 
     Args:
-        policy: scores the rollouts with gradient; its gradients are zero.
-        reference: scores them without; under the same goals, unless the setting `kl.condition_reference` is False. A
-            reference whose goal encoder was added for this run is still goal-free; an already conditioned one anchors
-            the policy to its goal-following.
-        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        policy: scores the rollouts with gradient; gradients are zero before.
+        reference: scores the rollouts without gradient; under the same goals, unless the setting
+            `kl.condition_reference` is False. A reference whose goal encoder was added for this run is still goal-free;
+            an already conditioned reference anchors the policy to the reference's goal-following.
+        experiences: Rollouts of this process with rewards, an entry per micro batch.
         terms: Coefficients of the loss, and the global counts that sums are divided by.
         fabric: precision, and the processes that the statistics are summed over.
         rollouts_per_pass: rollouts of a scenario that are scored at once; changes memory, not the gradient.

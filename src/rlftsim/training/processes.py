@@ -1,7 +1,7 @@
-"""Several processes on a CPU: forked from the one that trains, and connected with it by pipes.
+"""Several processes on a CPU: forked from the training process, and connected with that process by pipes.
 
-Forked processes have whatever this one has in memory, and start in milliseconds. So a script needs no main guard, a
-notebook may train with the rewards and policies that its cells define, and scenarios that have been read are shared.
+Forked processes share the memory of this process, and start in milliseconds. So a script needs no main guard, a
+notebook may train with the rewards and policies that cells define, and scenarios that have been read are shared.
 """
 
 import multiprocessing
@@ -27,17 +27,18 @@ from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabr
 
 @contextmanager
 def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> Iterator[Fabric]:
-    """Start the processes of a run, and yield the fabric of this one, which has rank 0, for its share of the work.
+    """Start the processes of a run, and yield the fabric of this process, which has rank 0, for a share of the work.
 
-    On a CPU the other processes are forked here, and call the function. They print nothing and write no files. They end
-    with the `with`, also with an error, Ctrl-C, or a kill of this process. An error of theirs is raised here.
+    On a CPU the other processes are forked here, and call the function. The forked processes print no text, write no
+    files, and end with the `with`, also with an error, Ctrl-C, or a kill of this process. Errors of forked processes
+    are raised here.
 
     Args:
-        work: Function that the other processes call, each with the fabric that it sees itself in.
+        work: Function that the other processes call, each with the fabric of the calling process.
         config: Device settings with a number of processes, not "auto".
 
     Raises:
-        ConfigError: Several processes, but this one cannot be forked, or they should have several threads.
+        ConfigError: Several processes, but this process cannot be forked, or several threads per process.
         DataError: A process died.
     """
     fabric, processes = start_fabric(config), config.processes
@@ -109,7 +110,7 @@ class LostProcessError(DataError):
 
 @dataclass(frozen=True, eq=False)
 class LinkedProcess:
-    """One of several processes on a CPU, as a `Fabric`."""
+    """A process of several on a CPU, as a `Fabric`."""
 
     alone: Fabric
     """Device and precision."""
@@ -125,7 +126,7 @@ class LinkedProcess:
 
     @property
     def is_global_zero(self) -> bool:
-        """True for the process that forked the others."""
+        """True for the process that forked all other processes."""
         return self.global_rank == 0
 
     def autocast(self) -> AbstractContextManager[Any]:
@@ -137,14 +138,14 @@ class LinkedProcess:
         self.alone.backward(tensor)
 
     def all_reduce(self, data: Tensor, *, reduce_op: str) -> Tensor:
-        """Sum of a tensor over all processes, the same bits in each of them and in each run.
+        """Sum of a tensor over all processes, the same bits in each process and in each run.
 
         Args:
             data: this process's summand.
             reduce_op: "sum".
 
         Raises:
-            LostProcessError: another process died.
+            LostProcessError: a process died.
         """
         assert reduce_op == "sum"
         if not self.is_global_zero:

@@ -1,4 +1,4 @@
-"""The reference of fine-tuning: a frozen copy of the policy, the KL penalty towards it, and its slow sync."""
+"""The reference of fine-tuning: a frozen copy of the policy, the KL penalty towards the copy, and the slow sync."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -46,7 +46,7 @@ class KlConfig:
 
 @dataclass(eq=False, kw_only=True)
 class RewardLearner(Learner):
-    """A policy in fine-tuning with its frozen reference, the KL penalty's strength and the alarms."""
+    """A policy in fine-tuning with the frozen reference, the KL penalty's strength and the alarms."""
 
     reference: Any
     beta: float
@@ -58,7 +58,7 @@ class RewardLearner(Learner):
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Modules that a checkpoint holds: the policy and its reference."""
+        """Modules that a checkpoint holds: the policy and the reference."""
         return {"policy": self.policy, "reference": self.reference}
 
     def to_numbers(self) -> dict[str, float]:
@@ -72,7 +72,7 @@ class RewardLearner(Learner):
 
 
 def adapt_beta(beta: float, kl: float, config: KlConfig) -> float:
-    """Strength of the penalty after an update, within its bounds: beta (1 + clip(KL/target - 1, -0.2, 0.2) / horizon).
+    """Strength of the penalty after an update, within bounds: beta (1 + clip(KL/target - 1, -0.2, 0.2) / horizon).
 
     Args:
         beta: strength during the update.

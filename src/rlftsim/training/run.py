@@ -23,9 +23,10 @@ from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
 from rlftsim.training.data import share_cache
-from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios, find_method
+from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 from rlftsim.training.processes import linked_processes
+from rlftsim.training.registry import find_method
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
 from rlftsim.training.validation import ValidationConfig, check_validation, validate
 
@@ -42,15 +43,14 @@ def train_policy(
     held_out: TrainingScenarios | None = None,
     card: str = "",
 ) -> Path:
-    """Train a policy in place; resumes where a run in `out` was stopped, or ended with fewer of what `may_grow`.
+    """Train a policy in place; resumes where a run in `out` was stopped, or ended below a setting that `may_grow`.
 
     Args:
-        policy: An nn.Module that has what the method needs, and `save_pretrained`.
-        scenarios: Data set, list or single scenario, with their futures.
+        policy: An nn.Module with the attributes that the method needs, and `save_pretrained`.
+        scenarios: Data set, list or single scenario, with futures.
         out: Folder of the run: settings, metrics, checkpoints, and the model at the end.
-        settings: Settings of the run, whose type says the method: `FinetuneConfig` trains by rewards, `PretrainConfig`
-            along the log, and so on. A run keeps the number of processes that it was begun with, which rounding depends
-            on.
+        settings: Settings of the run; the type decides the method: `FinetuneConfig` trains by rewards, `PretrainConfig`
+            along the log, and so on. A resumed run keeps the number of processes, which rounding depends on.
         held_out: Scenarios to validate on in closed loop, see `validation` of the settings; None = no validation.
         card: README of the resulting model folder.
 
@@ -60,11 +60,11 @@ def train_policy(
     Raises:
         ConfigError: The method cannot train this policy or does not validate, there is no scenario, or several
             processes cannot be started here.
-        DataError: A scenario lacks what the method needs, the folder cannot be written to, or a process died.
-        CheckpointError: `out` holds another run or a damaged one, or the run diverged (its last good checkpoint is
+        DataError: A scenario lacks data that the method needs, the folder cannot be written to, or a process died.
+        CheckpointError: `out` holds a different or a damaged run, or the run diverged (the last good checkpoint is
             named).
-        NotYetError: Another run is at work in `out`.
-        KeyboardInterrupt: Ctrl-C, or a signal like it; says from where the run goes on.
+        NotYetError: A second run is at work in `out`.
+        KeyboardInterrupt: Ctrl-C or a similar signal; says from where the run goes on.
     """
     method = find_method(settings)
     if method is None:
@@ -98,7 +98,7 @@ def _make_updates(
     card: str,
     fabric: Fabric,
 ) -> Path:
-    """The model of a run: all updates that are left, in one of its processes.
+    """The model of a run: all updates that are left, in this process.
 
     Ctrl-C waits for the end of an update, which becomes a checkpoint.
     """
@@ -130,7 +130,7 @@ def _hold_folder(out: Path, fabric: Fabric) -> Iterator[None]:
     """Hold the folder of a run, by the process that writes.
 
     Raises:
-        NotYetError: Another run is at work there.
+        NotYetError: A second run is at work there.
         DataError: The folder cannot be written to.
     """
     refusal = None
@@ -152,11 +152,11 @@ class TrainingRun:
 
     Args:
         title: Label of the progress bar.
-        policy: Initial policy, whose fingerprint becomes a part of the run's identity.
-        scenarios: Training scenarios; another data set or order of scenarios is refused.
+        policy: Initial policy; the fingerprint becomes a part of the run's identity.
+        scenarios: Training scenarios; a different data set or order of scenarios is refused.
         out: Folder of the run.
         settings: Settings of the method, stored in the folder.
-        learner: Fresh state, brought to that of the newest checkpoint by `resume`.
+        learner: Fresh state, brought to the newest checkpoint by `resume`.
         fabric: Device and processes; only rank 0 writes files.
 
     Raises:
@@ -189,7 +189,7 @@ class TrainingRun:
             )
 
     def resume(self) -> None:
-        """Bring the learner to the state of the newest checkpoint, if there is one.
+        """Bring the learner to the state of the newest checkpoint, if any.
 
         Raises:
             CheckpointError: The checkpoint is damaged, or a longer run was begun in the folder.
@@ -217,11 +217,11 @@ class TrainingRun:
     def progress(self) -> Iterator[Callable[[], bool]]:
         """Show the progress of the updates made inside; yields a function that is True once Ctrl-C was pressed.
 
-        Ctrl-C does not wait where lightning-fabric or torchrun started several processes: it reaches each at another
-        update, and one that goes on would wait for one that stopped.
+        Ctrl-C does not wait where lightning-fabric or torchrun started several processes: Ctrl-C reaches each process
+        at a different update, and a running process would wait for a stopped process.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C, or a signal like it, when the update is done.
+            KeyboardInterrupt: Ctrl-C or a similar signal, when the update is done.
         """
         waits = self._fabric.world_size == 1 or self._settings.device.forks
         is_shown = self._fabric.is_global_zero
@@ -238,7 +238,7 @@ class TrainingRun:
             raise
 
     def finish_update(self, report: UpdateReport, *, is_last: bool) -> None:
-        """Log an update, and write a checkpoint if one is due.
+        """Log an update, and write a checkpoint if due.
 
         Args:
             report: Outcome of the update.
@@ -265,7 +265,7 @@ class TrainingRun:
         self._advance(note=report.note)
 
     def _check_divergence(self, report: UpdateReport, *, has_checked_weights: bool) -> None:
-        """Raise where more updates make no sense; on every process, or the others would wait forever."""
+        """Raise where more updates make no sense; on every process, or other processes would wait forever."""
         learner = self._learner
         # Never more skipped updates than the run has.
         if learner.skipped_in_a_row >= min(self._settings.max_skipped_in_a_row, self.num_updates):
@@ -294,7 +294,7 @@ class TrainingRun:
 
 
 def _count_weights(learner: Learner) -> str:
-    """Number of weights that are trained, and of all if they are more, for a message: 49 of 462,696 weights."""
+    """Number of weights that are trained, and of all weights if more, for a message: 49 of 462,696 weights."""
     trained = sum(p.numel() for p in learner.parameters)
     total = sum(p.numel() for p in learner.policy.parameters())
     return f"{trained:,} weights" if trained == total else f"{trained:,} of {total:,} weights"

@@ -47,7 +47,7 @@ MAY_CHANGE = (
 
 
 def may_change(name: str) -> bool:
-    """True for a setting, named with dots, that may have another value when a run is resumed."""
+    """True for a setting, named with dots, that may have a different value when a run is resumed."""
     return any(name == free or name.startswith(f"{free}.") for free in MAY_CHANGE)
 
 
@@ -70,17 +70,17 @@ RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, "augmented_goals")
 
 
 def board_tag(name: str) -> str:
-    """A metric's name in TensorBoard: that of metrics.jsonl, behind its group if it has one."""
+    """A metric's name in TensorBoard: the name in metrics.jsonl, behind the group if any."""
     groups = [group for group, beginnings in BOARD_GROUPS.items() if name.startswith(beginnings)]
     return "/".join([*groups, name])
 
 
 def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
-    """Hashes of what a run starts from.
+    """Hashes of the inputs that a run starts from.
 
     Args:
-        policy: its weights, settings and vocabulary count.
-        scenarios: their ids and order count, and the files of a data set.
+        policy: Policy with the weights, settings and vocabulary to hash.
+        scenarios: Scenarios with the ids and order to hash, or a data set with files to hash, too.
     """
     ids = hashlib.blake2b(digest_size=16)
     # Not the scenarios themselves: reading every one would take minutes.
@@ -91,7 +91,7 @@ def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names.
+    """Nested settings by dotted name.
 
     Args:
         values: mappings at any depth.
@@ -107,7 +107,7 @@ def stored_settings(path: Path) -> dict[str, Any]:
     """Settings and inputs of the run in a folder, empty where no run has begun.
 
     Raises:
-        CheckpointError: the file that holds them is damaged.
+        CheckpointError: the file of settings is damaged.
     """
     file = path / "config.json"
     try:
@@ -149,8 +149,8 @@ class RunFolder:
     Args:
         path: Folder of the run, created if missing.
         config: a dataclass of settings.
-        inputs: hashes of what the run starts from, see `describe_inputs`.
-        writes: False in all processes but that of rank 0.
+        inputs: hashes of the run's inputs, see `describe_inputs`.
+        writes: False in all processes but rank 0.
         may_grow: settings of the top level that may be raised when the folder is opened again, such as epochs where
             no update depends on the run's end.
 
@@ -191,9 +191,9 @@ class RunFolder:
         return (self.model / "config.json").exists()
 
     def finish(self) -> None:
-        """Store the settings of a run that was made longer; until then they are those of the model that was here.
+        """Store the settings of a run that was made longer; until then the stored settings belong to the earlier model.
 
-        That model is none any more, so that a kill before the new one is complete leaves none of other settings.
+        The earlier model is removed, so that a kill before the new model is complete leaves no model of other settings.
         """
         if self._writes and self.grows_from:
             (self.model / "config.json").unlink(missing_ok=True)
@@ -204,7 +204,7 @@ class RunFolder:
         write_text(self.path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
     def _checked_stored_settings(self, config: Any, may_grow: Collection[str]) -> dict[str, Any]:
-        """The stored settings of the run that was begun here, once they fit those given."""
+        """The stored settings of the run that was begun here, once equal to the given settings."""
         old, new = flatten(stored_settings(self.path)), flatten(config)
         if not old:
             return old
@@ -228,7 +228,7 @@ class RunFolder:
         return old
 
     def diverged(self, cause: str, remedy: str) -> CheckpointError:
-        """The error of a run that makes no sense any more; names its last good checkpoint.
+        """The error of a run that makes no sense any more; names the last good checkpoint.
 
         Args:
             cause: clause that follows the folder's name.
@@ -268,7 +268,7 @@ class RunFolder:
                     self._board.add_scalar(board_tag(name), value, update)
 
     def close(self) -> None:
-        """Flush what is pending."""
+        """Flush pending metrics."""
         if self._board is not None:
             with errors_name(self.path / "tensorboard"):
                 self._board.close()
@@ -281,7 +281,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _read_lines(metrics: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Text and values of each line of metrics; without those that are no JSON, such as one that a kill cut short."""
+    """Text and values of each line of metrics; without lines that are no JSON, such as a line that a kill cut short."""
     lines = []
     for line in metrics.read_text(encoding="utf-8", errors="replace").splitlines():
         with suppress(DataError):

@@ -1,6 +1,6 @@
-"""Closed-loop realism of a model in training, and its use of the map, on scenarios that it is not trained on.
+"""Closed-loop realism of a model in training, and the use of the map, on scenarios held out of training.
 
-It draws from no random generator that the training uses, so a run ends with the same bits with and without it.
+Validation draws from no random generator that the training uses, so a run ends with the same bits with and without.
 """
 
 import copy
@@ -76,7 +76,7 @@ class ValidationConfig:
 
 
 def check_validation(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
-    """Refuse before a run what would end it at its first validation.
+    """Refuse before a run any cause that would end the run at the first validation.
 
     Args:
         model: Model in training, of which a copy simulates.
@@ -97,20 +97,20 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
 
 @torch.no_grad()
 def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric) -> dict[str, float]:
-    """Mean realism of a model's rollouts, and its use of the map; each process takes its part of the scenarios.
+    """Mean realism of a model's rollouts, and the use of the map; each process takes a part of the scenarios.
 
     Args:
-        model: a policy; left as it is, training mode included.
-        scenarios: Held-out scenarios to select from, with their futures.
+        model: a policy; left unchanged, training mode included.
+        scenarios: Held-out scenarios to select from, with futures.
         config: number and choice of scenarios and rollouts.
         fabric: Processes of the run, over which sums are added.
 
     Returns:
         Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
-        predicts tokens its loss and map use on vehicles (`training.map_use`), and the seconds it took.
+        predicts tokens the loss and map use on vehicles (`training.map_use`), and the seconds taken.
 
     Raises:
-        DataError: a scenario withholds its future.
+        DataError: a scenario withholds the future.
     """
     from rlftsim.statistics import interval_around  # scipy.stats: half a second that configurations need not pay
 

@@ -269,10 +269,13 @@ def test_damaged_and_missing_files_are_refused(policy, tables, tmp_path):
     torch.save({"state_dict": export_catk(policy)}, tmp_path / "whole.ckpt")
     data = (tmp_path / "whole.ckpt").read_bytes()
     (tmp_path / "half.ckpt").write_bytes(data[: len(data) // 2])
+    number_of_disks = data.rindex(b"PK\x06\x07") + 16
+    (tmp_path / "disks.ckpt").write_bytes(data[:number_of_disks] + b"\x02" + data[number_of_disks + 1 :])
     (tmp_path / "half.safetensors").write_bytes(b"\x10" + bytes(20))
     torch.save({"weights": 1}, tmp_path / "none.ckpt")
     for name, words in {
         "half.ckpt": "neither safetensors nor",
+        "disks.ckpt": "zipfiles that span multiple disks",
         "half.safetensors": "damaged safetensors",
         "none.ckpt": "no weights under 'state_dict'",
         "absent.ckpt": "no such file",

@@ -5,7 +5,6 @@ import pytest
 
 from rlftsim.scenario.synthetic.bodies import (
     BumperPath,
-    LabelNoise,
     add_label_noise,
     build_pedestrian,
     build_vehicle,
@@ -90,7 +89,7 @@ def test_label_noise_leaves_standing_cars_frozen():
     rng = np.random.default_rng(0)
     position, heading, velocity = np.zeros((91, 2)), np.zeros(91), np.zeros((91, 2))
     velocity[:45, 0] = 8.0
-    noisy, turned, _ = add_label_noise(rng, LabelNoise(0.01, 0.004, 0.001, 0.03), position, heading, velocity)
+    noisy, turned, _ = add_label_noise(rng, 0.01, position, heading, velocity)
     assert np.all(noisy[45:] == 0.0)
     assert np.all(turned[45:] == 0.0)
     assert 0.005 < noisy[:45, 0].std() < 0.02

@@ -73,8 +73,8 @@ def test_lines_fall_into_pieces_and_lanes_do_not():
 def test_a_crop_keeps_links_between_the_lanes_it_keeps():
     lanes = [np.stack([np.arange(21.0) + 20 * k, np.zeros(21)], axis=1) for k in range(3)]
     features = tuple(Feature(k + 1, MapFeatureType.LANE_SURFACE_STREET, lanes[k], 13.4) for k in range(3))
-    whole = NetworkMap(features, {}, ((1, 2), (2, 3)), (), (), ())
-    cropped = MapCropper.of(whole, Ground(5.0, (0.0, 0.0), ())).crop(np.array([[10.0, 0.0]]), 15.0)
+    whole = NetworkMap(features, ((1, 2), (2, 3)), (), (), ())
+    cropped = MapCropper(whole, Ground(5.0, (0.0, 0.0), ())).crop(np.array([[10.0, 0.0]]), 15.0)
     assert cropped.feature_id.tolist() == [1, 2]
     assert cropped.topology.exit_lanes.tolist() == [[1, 2]]
     assert cropped.topology.entry_lanes.tolist() == [[2, 1]]

@@ -41,7 +41,7 @@ def test_the_same_seed_draws_the_same_plan():
 
 def test_gutters_vary_between_streets_within_two_meters():
     plan = draw("city", 2)
-    gutters = {lane.width_m for street in plan.streets for lane in street.lanes if lane.kind == "gutter"}
+    gutters = {lane.width_m for street in plan.streets for lane in street.lanes if lane.lane_type == "gutter"}
     assert len(gutters) > 5
     assert min(gutters) >= 0.3
     assert max(gutters) <= 2.0

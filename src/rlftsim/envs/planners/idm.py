@@ -1,4 +1,4 @@
-"""A planner that follows its route and keeps its distance, with nuPlan's parameters."""
+"""A planner that follows the route and keeps a distance, with nuPlan's parameters."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ class IdmPlanner:
         self.config = config or IdmConfig()
 
     def reset(self, info: dict[str, Any]) -> None:
-        """Nothing: it has no memory."""
+        """Do nothing: an IDM planner has no memory."""
 
     def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "2"]:
         """Acceleration behind the leader, steering for the route."""

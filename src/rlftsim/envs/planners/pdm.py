@@ -1,8 +1,8 @@
-"""A planner that simulates fifteen proposals and takes the one that scores best, in the style of PDM-Closed.
+"""A planner that simulates fifteen proposals and takes the best score, in the style of PDM-Closed.
 
 After Dauner et al., "Parting with Misconceptions about Learning-based Vehicle Motion Planning" (2023), as configured in
-tuplan_garage. Differences: it reads observations of this package, plans every half second, and measures the drivable
-area by road edges. n proposals, T steps, K other boxes; frame: the agent's at the time of planning.
+tuplan_garage. Differences: the planner here reads observations of this package, plans every half second, and measures
+the drivable area by road edges. n proposals, T steps, K other boxes; frame: the agent's at the time of planning.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ LEAST_PROGRESS_M = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """Motions that were simulated, and the controls that lead to them."""
+    """Simulated motions, and the controls that lead there."""
 
     motion: Float[np.ndarray, "n T1 5"]
     controls: Float[np.ndarray, "n T 2"]
@@ -78,7 +78,7 @@ class PdmPlanner:
 
 
 def simulate_proposals(view: View) -> Proposals:
-    """Drive along the route at several speeds and offsets for 4 s; the others keep their velocity."""
+    """Drive along the route at several speeds and offsets for 4 s; all other agents keep a constant velocity."""
     fraction, offset = (v.ravel() for v in np.meshgrid(SPEED_FRACTIONS, OFFSETS_M))
     free_speed = fraction * (view.limit_mps or CONFIG.speed_mps)
     n, bicycle = len(free_speed), Bicycle()
@@ -110,10 +110,10 @@ def simulate_proposals(view: View) -> Proposals:
 
 
 def collisions(view: View, motion: Float[np.ndarray, "n T1 5"]) -> Bool[np.ndarray, "n T1"]:
-    """True from the step on at which a proposal meets a box that is not behind it; overlaps at the start are left out.
+    """True from the step on at which a proposal meets a box ahead or beside; overlaps at the start are left out.
 
     Args:
-        view: What the planner sees, in the ego frame: x ahead, meters.
+        view: View of the planner, in the ego frame: x ahead, meters.
         motion: Motion of the proposals, ego frame at the time of planning.
     """
     time = STEP_S * np.arange(motion.shape[1])
@@ -128,7 +128,7 @@ def score_proposals(
     """NC · DDC · DAC · (5 progress + 5 TTC + 2 comfort) / 12 of each proposal.
 
     Args:
-        view: What the planner sees, in the ego frame: x ahead, meters.
+        view: View of the planner, in the ego frame: x ahead, meters.
         motion: Motion of the proposals, ego frame at the time of planning.
         collides: True from the step of a collision on, as `collisions` returns it.
     """
@@ -164,7 +164,7 @@ def score_proposals(
 def _meets(
     view: View, motion: Float[np.ndarray, "n t 5"], boxes: Float[np.ndarray, "t K 5"]
 ) -> Bool[np.ndarray, "n t K"]:
-    """True where a proposal overlaps a box that is not behind it."""
+    """True where a proposal overlaps a box ahead or beside."""
     offset = boxes[..., :2] - motion[..., None, :2]  # [n, t, K, 2]
     meets = boxes_overlap(offset, motion[..., None, 2], boxes[..., 2], view.size, view.box_size)
     forward = offset[..., 0] * np.cos(motion[..., None, 2]) + offset[..., 1] * np.sin(motion[..., None, 2])

@@ -1,4 +1,4 @@
-"""Planners by name. A package of your own adds one with an entry point, or names it as `package.module:Class`:
+"""Planners by name, or as `package.module:Class`. A package of your own adds a name with an entry point:
 
 [project.entry-points."rlftsim.planners"]
 mine = "my_package:MyPlanner"

@@ -1,4 +1,4 @@
-"""Planners that look at nothing: the log itself, and constant velocity."""
+"""Planners without observations: the log itself, and constant velocity."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from rlftsim.geometry import wrapped
 
 
 class Replay:
-    """Drives as logged. With replayed traffic it gives the log back, so it tests the whole loop."""
+    """Drives as logged. With replayed traffic the result is the log, which tests the whole loop."""
 
     action: ActionType = "pose"
 
@@ -34,13 +34,13 @@ class Replay:
         self._steps, self._num_steps = _steps_between(poses), 0
 
     def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "3"]:
-        """The next logged pose in the frame of the present one."""
+        """The next logged pose in the frame of the present pose."""
         self._num_steps += 1
         return self._steps[self._num_steps - 1]
 
 
 def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"]:
-    """Each pose but the first in the frame of the one before, float32."""
+    """Each pose but the first in the frame of the pose before, float32."""
     offset = np.diff(poses[:, :2], axis=0)
     x, y = to_heading_frame(offset[:, 0], offset[:, 1], poses[:-1, 2])
     return np.stack([x, y, wrapped(np.diff(poses[:, 2]))], -1).astype(np.float32)
@@ -53,7 +53,7 @@ class ConstantVelocityPlanner:
     reverse = True
 
     def reset(self, info: dict[str, Any]) -> None:
-        """Nothing: it has no memory."""
+        """Do nothing: constant velocity needs no memory."""
 
     def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "2"]:
         """No acceleration, no steering."""

@@ -1,4 +1,4 @@
-"""View of planners that follow a route: the route as a line, boxes and stopping places on it."""
+"""View of planners that follow a route: the route as a line, boxes and stopping places on the line."""
 
 from dataclasses import dataclass
 from typing import Any

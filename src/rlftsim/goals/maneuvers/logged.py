@@ -16,7 +16,7 @@ from rlftsim.goals.maneuvers.proposals import (
 )
 from rlftsim.goals.maneuvers.side_paths import lane_change_paths
 from rlftsim.scenario.lane_graph import lane_graph
-from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
+from rlftsim.scenario.maneuver import Maneuver, classify_turn
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 
 IN_LANE_M = 1.5
@@ -45,7 +45,7 @@ def logged_maneuver(scenario: Scenario, track: int) -> Proposal | None:
         return None
     heading = np.unwrap(tracks.heading[track, steps].astype(np.float64))
     # 2. Its name.
-    maneuver = maneuver_of_turn(float(heading[-1] - heading[0]))
+    maneuver = classify_turn(float(heading[-1] - heading[0]))
     if maneuver == Maneuver.STRAIGHT:
         maneuver = _find_lane_change(scenario, track, path) or maneuver
     if maneuver is None:

@@ -30,7 +30,7 @@ from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S, Reach, compute_reach
 from rlftsim.goals.maneuvers.road_lines import crosses_forbidden_line
 from rlftsim.goals.maneuvers.side_paths import LONGEST_UTURN_M, change_length_m, lane_change_paths, uturn_paths
 from rlftsim.scenario.lane_graph import lane_graph
-from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, STRAIGHT_RAD, Maneuver, maneuver_of_turn
+from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, STRAIGHT_RAD, Maneuver, classify_turn
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, ObjectType, Scenario
 
 RoadTest = Callable[[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"], Float[np.ndarray, "3"]], Float[np.ndarray, "S"]]
@@ -217,7 +217,7 @@ def _follow_paths(paths: Iterable[LanePath], agent: CurrentAgent) -> Iterator[_C
         goal = _find_goal(path, reach)
         if goal is None:
             continue
-        maneuver = maneuver_of_turn(float(path.turn[goal]))
+        maneuver = classify_turn(float(path.turn[goal]))
         if maneuver is not None:
             yield _Candidate(maneuver, shorten_path(path, goal), goal < int(min(reach.usual_m, path.length_m)))
 

@@ -74,9 +74,9 @@ def _is_weight(name: object, value: Any) -> bool:
 def _unpickle(path: Path) -> Any:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file.")
-    if not zipfile.is_zipfile(path):
-        raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
     try:
+        if not zipfile.is_zipfile(path):
+            raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
         with zipfile.ZipFile(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
                 raise CheckpointError(f"{path}: packed, which torch.save never does: unpack it, or get the file again.")

@@ -1,4 +1,4 @@
-"""Bodies that move like vehicles, from a simulator's bumper on a lane; smooth walkers, from its jerky pedestrians.
+"""Bodies that move like vehicles, from a simulator's bumper on a lane; smooth walkers, from jerky pedestrians.
 
 Arrays run over the steps (0.1 s) during which a road user exists; positions in plan coordinates, meters.
 """
@@ -22,7 +22,7 @@ WALK_HEADING_SPEED_MPS = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One road user over the steps it exists, without label noise."""
+    """A road user over the steps of existence, without label noise."""
 
     object_type: ObjectType
     first_step: int
@@ -42,7 +42,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class BumperPath:
-    """A vehicle's front bumper as SUMO reports it: points on lane centers, their directions, and the lane changes."""
+    """A vehicle's front bumper as SUMO reports it: points on lane centers, directions, and the lane changes."""
 
     first_step: int
     center: Float[np.ndarray, "n 2"]
@@ -52,7 +52,7 @@ class BumperPath:
     change_steps: tuple[int, ...] = ()
     """First step on the new lane."""
     change_left_m: tuple[float, ...] = ()
-    """Distance of the new lane from the old one to the left (negative: to the right)."""
+    """Distance from the old lane to the new lane, to the left (negative: to the right)."""
 
 
 def smoother_step(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -66,16 +66,16 @@ def lane_change_offset(
 ) -> Float[np.ndarray, "n"]:
     """Lateral offset that turns a jump between two lane centers into a smooth step along the driven distance.
 
-    A function of distance, not of time: a car that stops in the middle of a lane change stands where it is.
+    A function of distance, not of time: a car that stops in the middle of a lane change stands still.
 
     Args:
-        driven_m: distance driven since the first step.
-        speed_mps: speed per step.
-        step: first step on the new lane.
-        left_m: signed distance of the new lane from the old one, positive to the left.
+        driven_m: Distance driven since the first step, m.
+        speed_mps: Speed at each step; a faster change is longer.
+        step: First step on the new lane.
+        left_m: Signed distance from the old lane to the new lane, m, positive to the left.
 
     Returns:
-        Meters to the left to add to the center of the current lane; adding it to the jump leaves no discontinuity.
+        Meters to the left to add to the center of the current lane; the sum with the jump has no discontinuity.
     """
     length = max(MIN_LANE_CHANGE_M, LANE_CHANGE_S * float(speed_mps[step]))
     # half of the change is driven before SUMO jumps to the new lane, half after
@@ -87,14 +87,14 @@ def lane_change_offset(
 def drag_rear_axle(
     bumper: Float[np.ndarray, "n 2"], length_m: float, direction: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "n"]:
-    """Heading of a body whose rear axle is dragged behind its front bumper (a tractrix), unwrapped.
+    """Heading of a body whose rear axle is dragged behind the front bumper (a tractrix), unwrapped.
 
     Args:
-        bumper: path of the middle of the front bumper.
-        length_m: length of the body.
-        direction: unit vector the body points along at the first step.
+        bumper: Path of the middle of the front bumper over n steps, m.
+        length_m: Length of the body, m.
+        direction: Unit vector that the body points along at the first step.
     """
-    # The rear wheels cannot slip sideways, so the axle only ever moves towards the bumper, at a fixed distance from it.
+    # The rear wheels cannot slip sideways, so the axle only ever moves towards the bumper, at a fixed distance.
     reach = REAR_AXLE_FROM_BUMPER * length_m
     rear_x, rear_y = bumper[0] - reach * direction
     heading = np.empty(len(bumper))
@@ -110,8 +110,8 @@ def smooth_over_time(values: Float[np.ndarray, "n ..."], sigma_s: float) -> Floa
     """Values convolved with a Gaussian along the steps; beyond the ends the first and the last value are repeated.
 
     Args:
-        values: one row per step.
-        sigma_s: standard deviation of the Gaussian in seconds.
+        values: Values with a row per step, 0.1 s apart.
+        sigma_s: Standard deviation of the Gaussian in seconds.
     """
     # beyond four standard deviations the Gaussian adds less than the grid that positions are rounded to
     sigma = sigma_s / STEP_S
@@ -140,12 +140,12 @@ def build_vehicle(
     """Body of a vehicle that follows a bumper path.
 
     Args:
-        path: bumper on lane centers.
-        object_type: vehicle or cyclist.
-        size: length, width, height in meters.
-        habit: the driver's way to keep the lane: constant offset to the left and amplitude of a slow weave in meters,
-            its phase.
-        is_evaluable: True = it may be a track to predict.
+        path: Bumper on lane centers, with the lane changes.
+        object_type: Type of the road user, VEHICLE or CYCLIST.
+        size: Length, width and height in meters.
+        habit: Position in the lane: constant offset to the left and amplitude of a slow weave in meters, and the phase
+            of the weave in radians.
+        is_evaluable: True = the vehicle may be a track to predict.
     """
     # 1. Offset from the lane centers: the driver's habit and smooth lane changes.
     driven = np.concatenate([[0.0], np.cumsum(path.speed_mps[1:] * STEP_S)])
@@ -155,30 +155,23 @@ def build_vehicle(
     # 2. The bumper's path, the heading of a body dragged by it, the center half a length behind it.
     normal = np.stack([-path.direction[:, 1], path.direction[:, 0]], axis=1)
     bumper = smooth_over_time(path.center + left[:, None] * normal, BUMPER_SMOOTHING_S)
-    # [n]: nothing but the path of the bumper decides the heading, so it can neither jump nor slip
+    # [n]: the path of the bumper alone decides the heading, which can neither jump nor slip
     heading = drag_rear_axle(bumper, size[0], path.direction[0])
     center = bumper - size[0] / 2 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    return Body(
-        object_type,
-        path.first_step,
-        center,
-        heading,
-        _central_differences(center),
-        size,
-        is_evaluable=is_evaluable,
-    )
+    velocity = _central_differences(center)
+    return Body(object_type, path.first_step, center, heading, velocity, size, is_evaluable=is_evaluable)
 
 
 def build_pedestrian(
     first_step: int, position: Float[np.ndarray, "n 2"], heading_rad: float, size: tuple[float, float, float]
 ) -> Body:
-    """Body of a pedestrian; while it stands it keeps the heading it had.
+    """Body of a pedestrian; a standing pedestrian keeps the last heading.
 
     Args:
-        first_step: step of the first position.
-        position: as SUMO reports it.
-        heading_rad: heading used when the pedestrian never walks.
-        size: length, width, height in meters.
+        first_step: Step of the first position.
+        position: Positions over n steps as reported by SUMO, m.
+        heading_rad: Heading of a pedestrian that never walks, rad.
+        size: Length, width and height in meters.
     """
     smooth = smooth_over_time(position, WALK_SMOOTHING_S)
     velocity = _central_differences(smooth)
@@ -192,33 +185,22 @@ def build_pedestrian(
     return Body(ObjectType.PEDESTRIAN, first_step, smooth, heading, velocity, size)
 
 
-@dataclass(frozen=True)
-class LabelNoise:
-    """Jitter of labels: white noise of one agent."""
-
-    along_m: float
-    across_m: float
-    heading_rad: float
-    velocity_mps: float
-
-
-def draw_label_noise(rng: np.random.Generator) -> LabelNoise:
-    """Noise of one agent: median 10 mm along, 4 mm across, 1 mrad, with a long tail."""
-    along = float(rng.gamma(1.6, 0.0078))
-    return LabelNoise(along, 0.4 * along, 0.1 * along, 3.0 * along)
+def draw_label_noise(rng: np.random.Generator) -> float:
+    """Noise of an agent along the heading, m: median 10 mm, with a long tail."""
+    return float(rng.gamma(1.6, 0.0078))
 
 
 def add_label_noise(
-    rng: np.random.Generator, noise: LabelNoise, position: np.ndarray, heading: np.ndarray, velocity: np.ndarray
+    rng: np.random.Generator, noise_m: float, position: np.ndarray, heading: np.ndarray, velocity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position [n, 2], heading [n] and velocity [n, 2] with noise that fades below 0.5 m/s and is 0 at a standstill.
 
     Args:
-        rng: source of the noise.
-        noise: its standard deviations.
-        position: m.
-        heading: rad.
-        velocity: m/s; decides the noise of a step.
+        rng: Generator of the noise, which draws for every step.
+        noise_m: Standard deviation along the heading, m; 0.4 times as much across, 0.1 times in rad, 3 times in m/s.
+        position: Centers [n, 2], m.
+        heading: Directions [n], rad.
+        velocity: Velocities [n, 2], m/s; slow steps have less noise.
     """
     # below a tenth of the limit there is no noise at all: a body that stands does not jitter
     moving = np.clip(np.linalg.norm(velocity, axis=1) / 0.5, 0.0, 1.0)
@@ -226,8 +208,8 @@ def add_label_noise(
     forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     shape = len(heading)
-    shift = (rng.normal(0, noise.along_m, shape) * moving)[:, None] * forward
-    shift += (rng.normal(0, noise.across_m, shape) * moving)[:, None] * left
-    turned = heading + rng.normal(0, noise.heading_rad, shape) * moving
-    pushed = velocity + rng.normal(0, noise.velocity_mps, (shape, 2)) * moving[:, None]
+    shift = (rng.normal(0, noise_m, shape) * moving)[:, None] * forward
+    shift += (rng.normal(0, 0.4 * noise_m, shape) * moving)[:, None] * left
+    turned = heading + rng.normal(0, 0.1 * noise_m, shape) * moving
+    pushed = velocity + rng.normal(0, 3.0 * noise_m, (shape, 2)) * moving[:, None]
     return position + shift, turned, pushed

@@ -14,7 +14,9 @@ from rlftsim.scenario.synthetic.street_plan import (
     Street,
     StreetClass,
     StreetPlan,
+    find_reachable,
     offset_polyline,
+    rotation_matrix,
 )
 
 
@@ -73,9 +75,7 @@ def _draw_grid(rng: np.random.Generator, columns: int, rows: int) -> Float[np.nd
     # irregular, then sheared, then turned: no two streets of a city are parallel to an axis
     grid += np.clip(rng.normal(0, 8.0, grid.shape), -14, 14)
     grid[..., 0] += rng.uniform(-0.25, 0.25) * grid[..., 1]
-    angle = rng.uniform(0, 2 * np.pi)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return grid @ turn.T
+    return grid @ rotation_matrix(rng.uniform(0, 2 * np.pi)).T
 
 
 def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float) -> tuple[PlannedLane, ...]:
@@ -91,17 +91,16 @@ def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float
 
 
 def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node) -> tuple[Street, Street]:
-    """The two directions of one street, each with its own strip of parking."""
-    # The line between the directions is straight or bulges. The squared sine keeps both of its ends straight, where a
-    # junction is cut out.
-    way = end.position - start.position
-    length = float(np.linalg.norm(way))
+    """Both directions of a street, each with a separate strip of parking."""
+    # The line between the directions is straight or bulges. The squared sine keeps both ends straight, where junctions
+    # are cut out.
+    direction = end.position - start.position
+    length = float(np.linalg.norm(direction))
     s = np.linspace(0, 1, max(31, int(length / 4)))
-    middle = start.position + s[:, None] * way  # [n, 2]
+    middle = start.position + s[:, None] * direction  # [n, 2]
     if rng.random() < 0.6:
-        direction = way / length
         bulge = np.clip(rng.normal(0, 0.035 * length), -0.08 * length, 0.08 * length) * np.sin(np.pi * s) ** 2
-        middle = middle + bulge[:, None] * np.array([-direction[1], direction[0]])
+        middle = middle + bulge[:, None] * (np.array([-direction[1], direction[0]]) / length)
     gutter = float(rng.uniform(0.3, 2.0))
     ids = (f"{start.node_id}to{end.node_id}", f"{end.node_id}to{start.node_id}")
     forward = Street(
@@ -130,7 +129,7 @@ def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Nod
 def _draw_links(
     rng: np.random.Generator, columns: int, rows: int, classes: list[StreetClass]
 ) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
-    """Streets of the grid as (node, node, line); some minor ones dropped as long as all nodes stay connected."""
+    """Streets of the grid as (node, node, line); minor streets dropped as long as all nodes stay connected."""
     # nodes are (column, row), lines are numbered columns first
     links = [((i, j), (i, j + 1), i) for i in range(columns) for j in range(rows - 1)]
     links += [((i, j), (i + 1, j), columns + j) for i in range(columns - 1) for j in range(rows)]
@@ -138,16 +137,11 @@ def _draw_links(
     for link in [links[int(k)] for k in rng.permutation(len(links))]:
         if classes[link[2]] == "arterial" or rng.random() >= probability:
             continue
-        rest = [other for other in links if other is not link]
-        # walk over the rest from one node: the street may go if all nodes are still reached
-        reached, frontier = set(), [(0, 0)]
-        while frontier:
-            here = frontier.pop()
-            if here not in reached:
-                reached.add(here)
-                frontier += [b if a == here else a for a, b, _ in rest if here in (a, b)]
-        if len(reached) == columns * rows:
-            links = rest
+        remaining = [candidate for candidate in links if candidate is not link]
+        # a street may go if all nodes are still connected
+        directed_links = [pair for a, b, _ in remaining for pair in ((a, b), (b, a))]
+        if len(find_reachable((0, 0), directed_links)) == columns * rows:
+            links = remaining
     return links
 
 
@@ -157,25 +151,25 @@ def _draw_control(
     """Right of way at a node of the grid, by the classes that cross there.
 
     Args:
-        rng: source of the choice.
-        crossing: classes of the column and the row.
-        degree: number of streets that meet.
-        lights: factor of the probability of traffic lights.
+        rng: Generator of the choice; a bend draws nothing.
+        crossing: Street classes of the column and of the row.
+        degree: Number of streets that meet; up to 2 make a bend.
+        lights: Factor of the probability of traffic lights, 1 in a city.
     """
     # at a bend there is nothing to give way to
     if degree <= 2:
         return "priority"
-    kinds = frozenset(crossing)
+    classes = frozenset(crossing)
     draw = rng.random()
-    if kinds == {"arterial"}:
+    if classes == {"arterial"}:
         return "traffic_light" if draw < lights else "allway_stop"
-    if kinds == {"arterial", "collector"}:
+    if classes == {"arterial", "collector"}:
         return "traffic_light" if draw < 0.55 * lights else "priority_stop"
-    if kinds == {"collector"}:
+    if classes == {"collector"}:
         return "traffic_light" if draw < 0.3 * lights else "allway_stop" if draw < 0.7 else "priority_stop"
-    if kinds == {"residential"}:
+    if classes == {"residential"}:
         return "allway_stop" if draw < 0.35 else "priority_stop" if draw < 0.65 else "right_before_left"
-    return "allway_stop" if kinds == {"collector", "residential"} and draw < 0.35 else "priority_stop"
+    return "allway_stop" if classes == {"collector", "residential"} and draw < 0.35 else "priority_stop"
 
 
 def _stub_ends(
@@ -184,9 +178,8 @@ def _stub_ends(
     """Streets by which traffic enters, as (node, outer end, line): one or none at each end of every line."""
     columns, rows = grid.shape[:2]
     ends = [((i, j), (i, inner), i) for i in range(columns) for j, inner in ((0, 1), (rows - 1, rows - 2))]
-    ends += [
-        ((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in ((0, 1), (columns - 1, columns - 2))
-    ]
+    borders = ((0, 1), (columns - 1, columns - 2))
+    ends += [((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in borders]
     stubs = []
     for outer, inner, line in ends:
         if classes[line] != "arterial" and rng.random() < 0.25:
@@ -201,16 +194,16 @@ def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
     """Irregular grid of arterials, collectors and residential streets with stubs where traffic enters.
 
     Args:
-        rng: source of all choices.
-        quiet: a quarter of minor streets, at most one arterial, hardly any lights.
+        rng: Generator of all choices; equal states give equal plans.
+        quiet: True = a quarter of minor streets with at most one arterial and hardly any lights.
 
     Returns:
-        A connected plan; every node but the fringe has a control fitting the classes that meet there.
+        A connected plan; every node but the fringe has a control that fits the classes of the streets at the node.
     """
-    # 1. The grid: classes of its lines, places of its nodes, streets between them and out of it.
+    # 1. The grid: classes of lines, positions of nodes, streets between nodes and out of the network.
     columns, rows = int(rng.integers(3, 5)), int(rng.integers(3, 5))
     classes = _draw_classes(rng, columns, rows, quiet)
-    profiles = [_draw_profile(rng, kind, line < columns, quiet) for line, kind in enumerate(classes)]
+    profiles = [_draw_profile(rng, street_class, line < columns, quiet) for line, street_class in enumerate(classes)]
     grid = _draw_grid(rng, columns, rows)
     links = _draw_links(rng, columns, rows, classes)
     stubs = _stub_ends(rng, grid, classes)
@@ -224,15 +217,11 @@ def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
         degree[b] += 1
     for a, _, _ in stubs:
         degree[a] += 1
-    inner = {
-        (i, j): Node(
-            f"n{i}{j}",
-            grid[i, j] * shrink,
-            _draw_control(rng, (classes[i], classes[columns + j]), int(degree[i, j]), 0.2 if quiet else 1.0),
-        )
-        for i in range(columns)
-        for j in range(rows)
-    }
+    inner = {}
+    for i, j in np.ndindex(columns, rows):
+        crossing = (classes[i], classes[columns + j])
+        control = _draw_control(rng, crossing, int(degree[i, j]), 0.2 if quiet else 1.0)
+        inner[i, j] = Node(f"n{i}{j}", grid[i, j] * shrink, control)
     fringe = [Node(f"f{k}", end * shrink, "dead_end", is_fringe=True) for k, (_, end, _) in enumerate(stubs)]
     # 3. Both directions of every street.
     streets: list[Street] = []

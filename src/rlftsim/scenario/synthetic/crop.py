@@ -1,10 +1,12 @@
-"""The part of a network's map that belongs to one scenario."""
+"""The part of a network's map that belongs to a scenario."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rlftsim.scenario.polylines import find_runs
 from rlftsim.scenario.synthetic.ground import Ground
 from rlftsim.scenario.synthetic.map_features import Feature, NetworkMap
 from rlftsim.scenario.types import LANE_TYPES, LaneTopology, MapFeatures, MapFeatureType
@@ -18,8 +20,8 @@ def on_grid(values: Float[np.ndarray, "..."], per_unit: int) -> Float[np.ndarray
     """Values rounded to a grid, float32, never -0.0: the codec stores such values in a few bits.
 
     Args:
-        values: any numbers.
-        per_unit: grid points per unit, a power of two.
+        values: Numbers in any unit, such as meters.
+        per_unit: Number of grid points per unit, a power of two.
     """
     return (np.rint(np.asarray(values, np.float64) * per_unit) / per_unit + 0.0).astype(np.float32)
 
@@ -30,98 +32,81 @@ class MapCropper:
 
     network_map: NetworkMap
     ground: Ground
-    points: Float[np.ndarray, "P 2"]
-    offsets: np.ndarray
 
-    @staticmethod
-    def of(network_map: NetworkMap, ground: Ground) -> "MapCropper":
-        """Cropper of a map.
-
-        Args:
-            network_map: map of the whole network in plan coordinates.
-            ground: heights for the points of the crop.
-        """
-        sizes = [len(feature.points) for feature in network_map.features]
-        points = np.concatenate([feature.points for feature in network_map.features])
-        return MapCropper(network_map, ground, points, np.append(0, np.cumsum(sizes)))
+    @cached_property
+    def _points(self) -> Float[np.ndarray, "P 2"]:
+        return np.concatenate([feature.points for feature in self.network_map.features])
 
     def crop(self, centers: Float[np.ndarray, "n 2"], radius_m: float) -> MapFeatures:
         """Features within a radius of any of the centers.
 
-        Lanes keep one contiguous stretch, lines and edges fall into pieces, crosswalks stay whole. The first piece
+        Lanes keep one contiguous stretch, lines and edges fall into several, crosswalks stay whole. The first stretch
         keeps the id.
 
         Args:
-            centers: plan coordinates, m.
-            radius_m: points farther from all centers are cut off.
+            centers: Positions [n, 2] that the crop surrounds, plan coordinates, m.
+            radius_m: Distance from the nearest center beyond which points are cut off, m.
         """
         # 1. Points inside, for all features at once.
         # a running minimum: all distances at once would take 8 bytes times points times centers
-        nearest = np.full(len(self.points), np.inf)
+        nearest = np.full(len(self._points), np.inf)
         for center in centers:
-            np.minimum(nearest, ((self.points - center) ** 2).sum(axis=1), out=nearest)
+            np.minimum(nearest, ((self._points - center) ** 2).sum(axis=1), out=nearest)
         inside = nearest < radius_m**2  # [P]
-        # 2. Pieces of each feature.
-        kept: list[tuple[int, Feature, np.ndarray]] = []
-        next_id = len(self.network_map.features) + 1
-        for index, feature in enumerate(self.network_map.features):
-            pieces = cut_feature(feature, inside[self.offsets[index] : self.offsets[index + 1]])
-            for number, piece in enumerate(pieces):
-                kept.append((feature.feature_id if number == 0 else next_id, feature, piece))
+        # 2. Stretches of each feature inside.
+        network_map = self.network_map
+        stretches: list[tuple[int, Feature, np.ndarray]] = []
+        next_id = len(network_map.features) + 1
+        borders = np.cumsum([len(feature.points) for feature in network_map.features])
+        for feature, inside_feature in zip(network_map.features, np.split(inside, borders)):
+            for number, polyline in enumerate(cut_feature(feature, inside_feature)):
+                stretches.append((feature.feature_id if number == 0 else next_id, feature, polyline))
                 next_id += number > 0
-        # 3. Arrays of the kept pieces.
-        whole = self.network_map
-        points = np.concatenate([piece for _, _, piece in kept]) if kept else np.zeros((0, 2))  # [P, 2]
-        height = on_grid(self.ground.height_at(points), HEIGHT_GRID_PER_M)  # [P]
-        is_lane = np.array([feature.feature_type in LANE_TYPES for _, feature, _ in kept])
-        speed = np.array([feature.speed_mps for _, feature, _ in kept]) * MPH_PER_MPS * is_lane
-        lanes = [row for row in kept if row[1].feature_type in LANE_TYPES]
-        lengths = {feature_id: len(piece) for feature_id, _, piece in lanes}
-        # links between lanes that still meet: the end of the first and the start of the second are both in the crop
-        starts = {lane_id for lane_id, feature, piece in lanes if np.array_equal(piece[0], feature.points[0])}
-        ends = {lane_id for lane_id, feature, piece in lanes if np.array_equal(piece[-1], feature.points[-1])}
-        links = [(lane, after) for lane, after in whole.entry_exit if lane in ends and after in starts]
+        # 3. Links between lanes that still meet: the end of the first and the start of the second are both in the crop.
+        lanes = [row for row in stretches if row[1].feature_type in LANE_TYPES]
+        lengths = {feature_id: len(polyline) for feature_id, _, polyline in lanes}
+        starts = {lane_id for lane_id, feature, polyline in lanes if np.array_equal(polyline[0], feature.points[0])}
+        ends = {lane_id for lane_id, feature, polyline in lanes if np.array_equal(polyline[-1], feature.points[-1])}
+        links = [(first, second) for first, second in network_map.entry_exit if first in ends and second in starts]
         neighbors = [
-            (lane, side, other, 0, lengths[lane] - 1, 0, lengths[other] - 1)
-            for lane, side, other in whole.neighbors
-            if lane in lengths and other in lengths
+            (lane, side, neighbor, 0, lengths[lane] - 1, 0, lengths[neighbor] - 1)
+            for lane, side, neighbor in network_map.neighbors
+            if lane in lengths and neighbor in lengths
         ]
-        present = {feature_id for feature_id, _, _ in kept}
-        signs = [(sign, lane) for sign, lane in whole.stop_sign_lanes if sign in present and lane in lengths]
-        return MapFeatures(
-            feature_id=np.array([feature_id for feature_id, _, _ in kept], np.int64),
-            feature_type=np.array([feature.feature_type for _, feature, _ in kept], np.int8),
-            points=np.concatenate([on_grid(points, MAP_GRID_PER_M), height[:, None]], axis=1),
-            offsets=np.append(0, np.cumsum([len(piece) for _, _, piece in kept])).astype(np.int64),
-            topology=LaneTopology(
-                entry_lanes=_rows([(b, a) for a, b in links], 2),
-                exit_lanes=_rows(links, 2),
-                neighbors=_rows(neighbors, 7),
-                stop_sign_lanes=_rows(signs, 2),
-                speed_limit_mph=on_grid(np.rint(speed / 5.0) * 5.0, 1),
-                interpolating=np.array([feature.interpolating for _, feature, _ in kept], bool),
-            ),
+        present = {feature_id for feature_id, _, _ in stretches}
+        signs = [(sign, lane) for sign, lane in network_map.stop_sign_lanes if sign in present and lane in lengths]
+        # 4. Arrays of the stretches, F in all with P points.
+        features = [feature for _, feature, _ in stretches]
+        points = np.concatenate([np.zeros((0, 2)), *(polyline for _, _, polyline in stretches)])  # [P, 2]
+        height = on_grid(self.ground.height_at(points), HEIGHT_GRID_PER_M)  # [P]
+        is_lane = np.array([feature.feature_type in LANE_TYPES for feature in features])
+        speed = np.array([feature.speed_mps for feature in features]) * MPH_PER_MPS * is_lane
+        topology = LaneTopology.of(
+            entry_lanes=sorted((second, first) for first, second in links),
+            exit_lanes=sorted(links),
+            neighbors=sorted(neighbors),
+            stop_sign_lanes=sorted(signs),
+            speed_limit_mph=on_grid(np.rint(speed / 5.0) * 5.0, 1),
+            interpolating=np.array([feature.interpolating for feature in features], bool),
         )
-
-
-def _rows(rows: list[tuple[int, ...]], columns: int) -> np.ndarray:
-    return np.array(sorted(rows), np.int64).reshape(-1, columns)
+        grid_points = np.column_stack([on_grid(points, MAP_GRID_PER_M), height])
+        lines = np.split(grid_points, np.cumsum([len(polyline) for _, _, polyline in stretches]))
+        ids, types = [feature_id for feature_id, _, _ in stretches], [feature.feature_type for feature in features]
+        return MapFeatures.of(zip(ids, types, lines), topology)
 
 
 def cut_feature(feature: Feature, inside: Bool[np.ndarray, "n"]) -> list[Float[np.ndarray, "m 2"]]:
-    """Pieces of a feature that survive a crop.
+    """Stretches of a feature that survive a crop.
 
     Args:
-        feature: one of the whole map.
-        inside: True for its points that lie in the crop.
+        feature: Feature of the whole map.
+        inside: True for the points of the feature that lie in the crop.
     """
     if not inside.any():
         return []
     if feature.feature_type in (MapFeatureType.CROSSWALK, MapFeatureType.STOP_SIGN):
         return [feature.points]
-    # runs of points inside: a run begins where the mask rises and ends where it falls
-    bounds = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
-    starts, stops = bounds[::2], bounds[1::2]
+    runs = find_runs(inside)
     if feature.feature_type in LANE_TYPES:
-        starts, stops = starts[:1], stops[-1:]  # a lane in two pieces would be two lanes without a link
-    return [feature.points[a:b] for a, b in zip(starts, stops, strict=True) if b - a >= 2]
+        runs = [(runs[0][0], runs[-1][1])]  # a lane in two stretches would be two lanes without a link
+    return [feature.points[start:stop] for start, stop in runs if stop - start >= 2]

@@ -1,18 +1,18 @@
-"""Travel demand: vehicle types with their drivers, trips of vehicles and bicycles, walks of pedestrians."""
+"""Travel demand: vehicle types with drivers, trips of vehicles and bicycles, walks of pedestrians."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from rlftsim.scenario.synthetic.street_plan import StreetPlan
+from rlftsim.scenario.synthetic.street_plan import StreetPlan, find_reachable
 from rlftsim.scenario.synthetic.sumo import SIMULATED_S
 from rlftsim.scenario.types import ObjectType
 
 
 @dataclass(frozen=True)
 class RoadUserType:
-    """A kind of vehicle together with its driver."""
+    """A type of vehicle together with the driver."""
 
     type_id: str
     vehicle_class: str
@@ -38,55 +38,53 @@ _SIZES = {
 
 
 NUM_GAITS = 8
-"""Number of kinds of pedestrians, which differ in their speed."""
+"""Number of types of pedestrians, which differ in speed."""
 VEHICLES_PER_LANE_AND_S = {"city": (0.02, 0.04), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
 """Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
 
 
-def draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
+def draw_size(rng: np.random.Generator, name: str) -> tuple[float, float, float]:
     """Length, width and height in meters of one road user.
 
     Args:
-        rng: source of the sizes.
-        kind: such as "car" or "pedestrian".
+        rng: Generator of the sizes, one draw for each.
+        name: Name of the road user in `_SIZES`, such as "car" or "pedestrian".
     """
-    length, width, height = (
-        float(np.clip(rng.normal(mean, spread), low, high)) for mean, spread, low, high in _SIZES[kind]
-    )
+    length, width, height = (float(np.clip(rng.normal(mean, std), low, high)) for mean, std, low, high in _SIZES[name])
     return length, width, height
 
 
 def draw_types(rng: np.random.Generator, count: int = 36) -> list[RoadUserType]:
-    """Types of one network: the last four are bicycles, the rest motor vehicles by their frequency.
+    """Types of one network: the last four are bicycles, the first ones motor vehicles by frequency.
 
     Args:
-        rng: source of kinds and sizes.
-        count: number of types.
+        rng: Generator of names and sizes; equal states give equal types.
+        count: Number of types, above 4; more types make traffic more diverse.
     """
-    kinds = list(rng.choice(list(_PROBABILITIES), count - 4, p=list(_PROBABILITIES.values()))) + ["bicycle"] * 4
-    kinds[0] = "car"  # at least one: an ego has to be found
+    names = list(rng.choice(list(_PROBABILITIES), count - 4, p=list(_PROBABILITIES.values()))) + ["bicycle"] * 4
+    names[0] = "car"  # at least one: an ego has to be found
     types = []
-    for index, kind in enumerate(kinds):
-        length, width, height = draw_size(rng, kind)
-        vehicle_class = _CLASSES.get(kind, str(kind))
-        object_type = ObjectType.CYCLIST if kind == "bicycle" else ObjectType.VEHICLE
-        types.append(RoadUserType(f"{kind}{index}", vehicle_class, object_type, length, width, height))
+    for index, name in enumerate(names):
+        length, width, height = draw_size(rng, name)
+        vehicle_class = _CLASSES.get(name, str(name))
+        object_type = ObjectType.CYCLIST if name == "bicycle" else ObjectType.VEHICLE
+        types.append(RoadUserType(f"{name}{index}", vehicle_class, object_type, length, width, height))
     return types
 
 
-def _type_xml(rng: np.random.Generator, kind: RoadUserType) -> str:
-    """Vehicle type of SUMO with the habits of its driver. The order of the draws decides all later ones."""
-    common = (
-        f'<vType id="{kind.type_id}" vClass="{kind.vehicle_class}" '
-        f'length="{kind.length_m:.2f}" width="{kind.width_m:.2f}" '
+def _type_xml(rng: np.random.Generator, user_type: RoadUserType) -> str:
+    """Vehicle type of SUMO with the habits of the driver. The order of the draws decides all later draws."""
+    attributes = (
+        f'<vType id="{user_type.type_id}" vClass="{user_type.vehicle_class}" '
+        f'length="{user_type.length_m:.2f}" width="{user_type.width_m:.2f}" '
         f'lcStrategic="{rng.uniform(0.6, 1.5):.2f}" lcSpeedGain="{rng.uniform(0.4, 1.8):.2f}" '
         f'lcKeepRight="{rng.uniform(0.0, 0.4):.2f}" lcMaxSpeedLatStanding="0" lcMaxSpeedLatFactor="0.25" '
         f'jmTimegapMinor="{rng.uniform(0.6, 1.4):.2f}" impatience="{rng.uniform(0.0, 0.3):.2f}" '
     )
-    if kind.object_type == ObjectType.CYCLIST:
-        return common + f'accel="1.0" decel="2.5" minGap="0.8" maxSpeed="{rng.uniform(3.8, 6.5):.2f}"/>'
+    if user_type.object_type == ObjectType.CYCLIST:
+        return attributes + f'accel="1.0" decel="2.5" minGap="0.8" maxSpeed="{rng.uniform(3.8, 6.5):.2f}"/>'
     mean = np.clip(rng.normal(1.0, 0.06), 0.88, 1.12)
-    return common + (
+    return attributes + (
         f'carFollowModel="EIDM" accel="{rng.uniform(1.5, 2.8):.2f}" decel="{rng.uniform(1.8, 3.2):.2f}" '
         f'tau="{rng.uniform(0.8, 2.0):.2f}" minGap="{rng.uniform(1.2, 3.2):.2f}" '
         f'speedFactor="normc({mean:.3f},0.08,0.6,1.5)"/>'
@@ -100,33 +98,29 @@ def _poisson_times(rng: np.random.Generator, rate_per_s: float) -> np.ndarray:
 
 
 def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadUserType]) -> list[tuple[float, str]]:
-    """Trips from fringe to fringe, more of them on wide and important streets."""
+    """Trips from fringe to fringe, more on wide and important streets."""
     fringe = {node.node_id for node in plan.fringe_nodes}
     weight = {"arterial": 1.6, "collector": 1.0, "residential": 0.6, "freeway": 1.0, "ramp": 0.5}
     sources = [street for street in plan.streets if street.from_node in fringe]
     sinks = [street for street in plan.streets if street.to_node in fringe]
-    per_lane = rng.uniform(*VEHICLES_PER_LANE_AND_S[plan.kind])
-    bicycles = 0.0 if plan.kind == "freeway" else rng.uniform(0.01, 0.06)
-    motor = [kind.type_id for kind in types if kind.object_type == ObjectType.VEHICLE]
-    cycles = [kind.type_id for kind in types if kind.object_type == ObjectType.CYCLIST]
+    per_lane = rng.uniform(*VEHICLES_PER_LANE_AND_S[plan.network_type])
+    bicycles = 0.0 if plan.network_type == "freeway" else rng.uniform(0.01, 0.06)
+    motor = [t.type_id for t in types if t.object_type == ObjectType.VEHICLE]
+    cycles = [t.type_id for t in types if t.object_type == ObjectType.CYCLIST]
+    links = [(street.from_node, street.to_node) for street in plan.streets]
     trips = []
     # Poisson arrivals at every entrance, by its lanes and class
     for source in sources:
-        lanes = sum(lane.kind == "travel" for lane in source.lanes)
-        # nodes to which streets lead from here: other trips would be dropped by the router
-        reachable, frontier = set(), [source.from_node]
-        while frontier:
-            here = frontier.pop()
-            if here not in reachable:
-                reachable.add(here)
-                frontier += [street.to_node for street in plan.streets if street.from_node == here]
+        lanes = sum(lane.lane_type == "travel" for lane in source.lanes)
+        # to nodes that streets lead to: the router would drop further trips
+        reachable = find_reachable(source.from_node, links)
         goals = [sink for sink in sinks if sink.to_node != source.from_node and sink.to_node in reachable]
         attraction = np.array([weight[goal.street_class] * len(goal.lanes) for goal in goals])
         for time in _poisson_times(rng, per_lane * lanes * weight[source.street_class]):
             goal = goals[int(rng.choice(len(goals), p=attraction / attraction.sum()))]
-            kind = rng.choice(cycles) if rng.random() < bicycles else rng.choice(motor)
+            type_id = rng.choice(cycles) if rng.random() < bicycles else rng.choice(motor)
             row = (
-                f'<trip id="v{len(trips)}" type="{kind}" depart="{time:.1f}" from="{source.street_id}" '
+                f'<trip id="v{len(trips)}" type="{type_id}" depart="{time:.1f}" from="{source.street_id}" '
                 f'to="{goal.street_id}" departLane="best" departSpeed="max"/>'
             )
             trips.append((float(time), row))
@@ -134,8 +128,8 @@ def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadU
 
 
 def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]]:
-    """Short walks between streets, alone or in groups; a few busy streets attract most of them."""
-    if plan.kind == "freeway":
+    """Short walks between streets, alone or in groups; a few busy streets attract most."""
+    if plan.network_type == "freeway":
         return []
     streets = [street.street_id for street in plan.streets]
     # a gamma distribution of small shape: many quiet streets, a few busy ones
@@ -157,12 +151,12 @@ def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]
 
 
 def write_demand(plan: StreetPlan, rng: np.random.Generator, path: Path) -> dict[str, RoadUserType]:
-    """Write types, trips and walks to a file for SUMO, ordered by departure, as SUMO wants them.
+    """Write types, trips and walks to a file for SUMO, ordered by departure, as SUMO requires.
 
     Args:
-        plan: streets to travel on.
-        rng: source of all choices.
-        path: the file.
+        plan: Streets to travel on, with the nodes where traffic enters.
+        rng: Generator of all choices; the order of draws decides the traffic.
+        path: File to write, XML of SUMO; an existing file is replaced.
 
     Returns:
         Type of each `type_id`.
@@ -170,9 +164,9 @@ def write_demand(plan: StreetPlan, rng: np.random.Generator, path: Path) -> dict
     types = draw_types(rng)
     departures = _vehicle_trips(rng, plan, types) + _walks(rng, plan)
     departures.sort(key=lambda row: row[0])
-    header = [_type_xml(rng, kind) for kind in types]
+    header = [_type_xml(rng, user_type) for user_type in types]
     for gait in range(NUM_GAITS):
         factor = rng.uniform(0.55, 1.45)
         header.append(f'<vType id="walker{gait}" vClass="pedestrian" speedFactor="normc({factor:.2f},0.08,0.4,1.7)"/>')
     path.write_text("\n".join(["<routes>", *header, *(row for _, row in departures), "</routes>"]))
-    return {kind.type_id: kind for kind in types}
+    return {user_type.type_id: user_type for user_type in types}

@@ -13,12 +13,13 @@ from rlftsim.scenario.synthetic.street_plan import (
     Street,
     StreetPlan,
     offset_polyline,
+    rotation_matrix,
 )
 
 
 @dataclass(frozen=True)
 class _Carriageway:
-    """One direction of a freeway: cuts along the arc and the properties that its segments share."""
+    """One direction of a freeway: cuts along the arc and the properties that all segments share."""
 
     name: str
     curvature: float
@@ -34,8 +35,8 @@ class _Carriageway:
         """Left border of a stretch, in driving direction.
 
         Args:
-            low_m: arc length where it begins.
-            high_m: arc length where it ends.
+            low_m: Arc length where the stretch begins, m.
+            high_m: Arc length where the stretch ends, m.
         """
         s = np.linspace(low_m, high_m, max(8, int((high_m - low_m) / 8)))
         # points of a circle through (0, 0) heading along +x; without curvature a straight line
@@ -49,8 +50,8 @@ class _Carriageway:
         """Street between two cuts.
 
         Args:
-            index: number of the cut where it begins.
-            extra_lanes: lanes beside the through lanes.
+            index: Number of the cut where the street begins; the next cut ends it.
+            extra_lanes: Number of lanes to the right of the through lanes.
         """
         return Street(
             street_id=f"{self.name}{index}",
@@ -68,8 +69,8 @@ class _Carriageway:
         """Triangle of pavement beside the through lanes, where an extra lane begins or ends.
 
         Args:
-            at_m: arc length at which it is as wide as a lane.
-            towards_m: arc length at which it has no width.
+            at_m: Arc length where the triangle is as wide as a lane, m.
+            towards_m: Arc length where the triangle has no width, m.
         """
         low, high = sorted((at_m, towards_m))
         border = self.inner_border(low, high)
@@ -79,26 +80,27 @@ class _Carriageway:
         return np.stack([through[at], widened[at], through[towards]])
 
 
-def _ramp(rng: np.random.Generator, way: _Carriageway, on: bool) -> Street:
+def _ramp(rng: np.random.Generator, road: _Carriageway, on: bool) -> Street:
     """On-ramp that ends where segment 1 begins, or off-ramp that begins where segment 3 ends.
 
-    It leaves the carriageway tangentially.
+    The ramp touches the carriageway tangentially.
     """
-    joint = way.cuts_m[1] if on else way.cuts_m[4]
+    joint = road.cuts_m[1] if on else road.cuts_m[4]
     length, spread = rng.uniform(160, 200), rng.uniform(34, 48)
     low, high = (joint - length, joint) if on else (joint, joint + length)
-    border = offset_polyline(way.inner_border(low, high), -way.lanes * way.width_m)
+    border = offset_polyline(road.inner_border(low, high), -road.lanes * road.width_m)
     # distance from the carriageway grows with a power above 2: neither a kink nor a jump of curvature at the joint
-    away = np.linspace(1.0, 0.0, len(border)) if on else np.linspace(0.0, 1.0, len(border))
-    points = border + spread * (away**2.2)[:, None] * (offset_polyline(border, -1.0) - border)
-    inner, outer = (f"{way.name}n1", f"{way.name}on") if on else (f"{way.name}n4", f"{way.name}off")
+    share = np.linspace(1.0, 0.0, len(border)) if on else np.linspace(0.0, 1.0, len(border))
+    points = border + spread * (share**2.2)[:, None] * (offset_polyline(border, -1.0) - border)
+    name = road.name
+    inner, outer = (f"{name}n1", f"{name}on") if on else (f"{name}n4", f"{name}off")
     return Street(
-        street_id=f"{way.name}{'on' if on else 'off'}ramp",
+        street_id=f"{outer}ramp",
         from_node=outer if on else inner,
         to_node=inner if on else outer,
         points=points,
         street_class="ramp",
-        lanes=(PlannedLane("gutter", way.gutter_m), PlannedLane("travel", way.width_m)),
+        lanes=(PlannedLane("gutter", road.gutter_m), PlannedLane("travel", road.width_m)),
         speed_mps=float(rng.uniform(16, 20)),
         priority=PRIORITY["ramp"],
     )
@@ -116,29 +118,25 @@ def draw_freeway_plan(rng: np.random.Generator) -> StreetPlan:
     tapers: list[np.ndarray] = []
     # the second carriageway follows the same arc the other way: turned by 180 degrees, with the opposite curvature
     for name, flip in (("a", 1.0), ("b", -1.0)):
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * flip
+        turn = rotation_matrix(angle) * flip
         on, off = rng.uniform(-190, -130), rng.uniform(130, 190)
         cuts = (-470.0, on, on + rng.uniform(130, 170), off - rng.uniform(90, 120), off, 470.0)
-        way = _Carriageway(
-            name, flip * curvature, cuts, int(rng.integers(3, 5)), width, median_half, speed, gutter, turn
-        )
+        lanes = int(rng.integers(3, 5))
+        carriageway = _Carriageway(name, flip * curvature, cuts, lanes, width, median_half, speed, gutter, turn)
         # a node at every cut; at both ends traffic enters and leaves
         for index, cut in enumerate(cuts):
-            place = way.inner_border(cut, cut + 1)[0]
+            position = carriageway.inner_border(cut, cut + 1)[0]
             end = index in (0, len(cuts) - 1)
-            nodes.append(Node(f"{name}n{index}", place, "dead_end" if end else "priority", is_fringe=end))
-        segments = [way.segment(k, 1 if k in (1, 3) else 0) for k in range(5)]
-        on_ramp, off_ramp = _ramp(rng, way, on=True), _ramp(rng, way, on=False)
+            nodes.append(Node(f"{name}n{index}", position, "dead_end" if end else "priority", is_fringe=end))
+        segments = [carriageway.segment(k, 1 if k in (1, 3) else 0) for k in range(5)]
+        on_ramp, off_ramp = _ramp(rng, carriageway, on=True), _ramp(rng, carriageway, on=False)
         nodes.append(Node(f"{name}on", on_ramp.points[0], "dead_end", is_fringe=True))
         nodes.append(Node(f"{name}off", off_ramp.points[-1], "dead_end", is_fringe=True))
         streets += [*segments, on_ramp, off_ramp]
         # through lanes go straight on; lane 1 (lane 0 is the gutter) of segments 1 and 3 belongs to the ramps
-        for lane in range(1, way.lanes + 1):
-            links.append(Connection(f"{name}0", f"{name}1", lane, lane + 1))
-            links.append(Connection(f"{name}1", f"{name}2", lane + 1, lane))
-            links.append(Connection(f"{name}2", f"{name}3", lane, lane + 1))
-            links.append(Connection(f"{name}3", f"{name}4", lane + 1, lane))
-        links.append(Connection(f"{name}onramp", f"{name}1", 1, 1))
-        links.append(Connection(f"{name}3", f"{name}offramp", 1, 1))
-        tapers += [way.taper(cuts[2], cuts[2] + 60), way.taper(cuts[3], cuts[3] - 60)]
+        for lane in range(1, carriageway.lanes + 1):
+            numbers = (lane, lane + 1, lane, lane + 1, lane)
+            links += [Connection(f"{name}{k}", f"{name}{k + 1}", numbers[k], numbers[k + 1]) for k in range(4)]
+        links += [Connection(f"{name}onramp", f"{name}1", 1, 1), Connection(f"{name}3", f"{name}offramp", 1, 1)]
+        tapers += [carriageway.taper(cuts[2], cuts[2] + 60), carriageway.taper(cuts[3], cuts[3] - 60)]
     return StreetPlan("freeway", tuple(nodes), tuple(streets), tuple(links), tuple(tapers))

@@ -22,11 +22,11 @@ Size = tuple[float, float, float]
 def moves_plausibly(
     position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], is_vehicle: bool = True
 ) -> bool:
-    """True for a path within the limits of acceleration, and for vehicles within those of slip and turning per step.
+    """True for a path within the limits of acceleration, for vehicles also within those of slip and turning per step.
 
     Args:
-        position: centers at consecutive steps, without label noise, m.
-        heading: directions of the body, rad.
+        position: Centers at consecutive steps, without label noise, m.
+        heading: Directions of the body at the same steps, rad.
         is_vehicle: False = a pedestrian, which may step sideways and turn on the spot.
     """
     if len(position) < 3:
@@ -55,17 +55,17 @@ def compute_overlap_s(
     """Longest time in seconds that any two vehicles share area while both are valid.
 
     Args:
-        position: centers of the vehicles, m.
-        heading: their headings, rad.
-        sizes: one per vehicle.
-        valid: steps at which a vehicle is seen.
+        position: Centers of v vehicles over n steps, m.
+        heading: Directions of the vehicles, rad.
+        sizes: Length, width and height of each vehicle, m.
+        valid: True at the steps at which a vehicle is observed.
     """
     longest = 0
     reach = np.array([np.hypot(size[0], size[1]) / 2 for size in sizes])
     for i in range(len(sizes) - 1):
-        # circles around the boxes first: few pairs come near each other at all
-        apart = np.linalg.norm(position[i + 1 :] - position[i], axis=-1) - reach[i] - reach[i + 1 :, None]
-        for j in np.flatnonzero(((apart < 0) & valid[i + 1 :] & valid[i]).any(axis=1)) + i + 1:
+        # circles around the boxes first: few pairs come close
+        gap_m = np.linalg.norm(position[i + 1 :] - position[i], axis=-1) - reach[i] - reach[i + 1 :, None]
+        for j in np.flatnonzero(((gap_m < 0) & valid[i + 1 :] & valid[i]).any(axis=1)) + i + 1:
             steps = np.flatnonzero(valid[i] & valid[j])
             gap = position[j, steps] - position[i, steps]
             hits = boxes_overlap(gap, heading[i, steps], heading[j, steps], np.array(sizes[i]), np.array(sizes[j]))
@@ -79,10 +79,10 @@ def compute_off_road_m(
     """Largest distance of a corner from the drivable area in meters, at every third step; 0 if all are inside.
 
     Args:
-        drivable: area as a shapely geometry.
-        position: centers of one body, m.
-        heading: its headings, rad.
-        size: its length and width, m.
+        drivable: Drivable area as a shapely geometry, plan coordinates, m.
+        position: Centers of a body over n steps, m.
+        heading: Directions of the body at the same steps, rad.
+        size: Length, width and height of the body, m; the height is ignored.
     """
     import shapely
 

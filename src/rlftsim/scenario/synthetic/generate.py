@@ -3,7 +3,7 @@
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import islice
 from operator import attrgetter
@@ -36,18 +36,19 @@ GENERATOR_VERSION = 1
 LICENSE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
 NETWORK_TYPES = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
 """Types of the networks in turn; a freeway gives half as many scenarios as the others."""
+DEFAULT_SPLITS = {"training": 0.8, "validation": 0.2}
 MAX_ATTEMPTS = 6
 
 
 @dataclass(frozen=True)
 class SyntheticRequest:
-    """Arguments of a generated data set. Together with the versions they determine every scenario."""
+    """Arguments of a generated data set, which determine every scenario together with the versions."""
 
     num_scenarios: int
     seed: int
     scenarios_per_network: int = 10
-    splits: Mapping[str, float] | None = None
-    """Fraction of the scenarios by split; None = 80 % training, 20 % validation."""
+    splits: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_SPLITS))
+    """Fraction of the scenarios by split."""
 
     def __post_init__(self) -> None:
         if self.num_scenarios < 1 or self.scenarios_per_network < 1:
@@ -55,13 +56,8 @@ class SyntheticRequest:
                 f"num_scenarios = {self.num_scenarios} and scenarios_per_network = {self.scenarios_per_network} "
                 "must both be at least 1"
             )
-        if abs(sum(self.fractions.values()) - 1.0) > 1e-6:
-            raise ConfigError(f"the fractions of the splits must sum to 1, got {dict(self.fractions)}")
-
-    @property
-    def fractions(self) -> Mapping[str, float]:
-        """Fraction of the scenarios by split."""
-        return self.splits if self.splits is not None else {"training": 0.8, "validation": 0.2}
+        if abs(sum(self.splits.values()) - 1.0) > 1e-6:
+            raise ConfigError(f"the fractions of the splits must sum to 1, got {dict(self.splits)}")
 
 
 @dataclass(frozen=True)
@@ -83,17 +79,15 @@ class NetworkTask:
 def plan_networks(request: SyntheticRequest) -> list[NetworkTask]:
     """Networks of all splits; no two splits share a network, because the seed of a network contains the split."""
     tasks = []
-    for split_number, (split, fraction) in enumerate(request.fractions.items()):
+    for split_number, (split, fraction) in enumerate(request.splits.items()):
         total = round(request.num_scenarios * fraction)
         count = max(1, round(total / request.scenarios_per_network))
         types = [NETWORK_TYPES[k % len(NETWORK_TYPES)] for k in range(count)]
         weights = np.array([0.5 if network_type == "freeway" else 1.0 for network_type in types])
         # cumulated and rounded, so that the numbers add up to the total
-        bounds = np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)
-        tasks += [
-            NetworkTask(split, k, types[k], int(bounds[k + 1] - bounds[k]), (request.seed, split_number, k))
-            for k in range(count)
-        ]
+        counts = np.diff(np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)).tolist()
+        for k, (network_type, num_scenarios) in enumerate(zip(types, counts)):
+            tasks.append(NetworkTask(split, k, network_type, num_scenarios, (request.seed, split_number, k)))
     return tasks
 
 
@@ -152,6 +146,7 @@ def generate(
         DataError: The folder holds other contents, or scenarios of other arguments, or another driver is at work.
         Unfinished: `runner` is a share, which is done, while others are not.
     """
+    splits = dict(DEFAULT_SPLITS if splits is None else splits)
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
     check_folder(folder, "data set")
@@ -166,7 +161,7 @@ def generate(
         "generator": __name__,
         "generator_version": GENERATOR_VERSION,
         "sumo_version": sumo.sumo_version(),
-        "arguments": {**asdict(request), "splits": dict(request.fractions)},
+        "arguments": asdict(request),
         "license": "CC0-1.0",
         "networks": [{"shard": task.shard_name, "kind": task.network_type, "seed": list(task.seed)} for task in tasks],
     }
@@ -190,7 +185,7 @@ def generate(
     with Lease(shards / ".lock", runner, "makes scenarios in") as lease:
         paths = run_items(
             "synthetic scenarios", tasks, partial(_write_shard, shards), lease=lease, runner=runner,
-            format=WholeFiles(shards, attrgetter("shard_name"), attrgetter("num_scenarios")),
+            format=WholeFiles(shards, attrgetter("shard_name"), ShardReader, attrgetter("num_scenarios")),
             show_progress=show_progress,
         )  # fmt: skip
         remove_temporaries_below(folder)  # of processes that were killed
@@ -207,12 +202,7 @@ def _write_shard(folder: Path, task: NetworkTask, advance: Advance, is_stopped: 
     """Write the scenarios of a task, unless the run is being stopped."""
     if is_stopped():
         return
-    writer = ShardWriter(folder / task.shard_name)
-    try:
+    with ShardWriter(folder / task.shard_name) as writer:
         for scenario in generate_scenarios(task):
             writer.add(scenario, task.split)
-    except BaseException:
-        writer.discard()
-        raise
-    writer.close()
     advance(task.num_scenarios)

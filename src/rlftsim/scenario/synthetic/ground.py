@@ -10,7 +10,7 @@ _TWO_PI = 2 * np.pi
 
 @dataclass(frozen=True)
 class Ground:
-    """A plane with two sine waves on it."""
+    """A plane with two sine waves."""
 
     height_m: float
     slope: tuple[float, float]
@@ -30,21 +30,15 @@ def draw_ground(rng: np.random.Generator, base_m: float = 24.0) -> Ground:
     """Ground that rises and falls by 1-2 m over 150 m and stays within about 5 m of `base_m` in the whole network.
 
     Args:
-        rng: source of the slope and the waves.
-        base_m: height at (0, 0) without waves.
+        rng: Generator of the slope and the waves.
+        base_m: Height at (0, 0) without waves, m.
     """
     waves = []
     for _ in range(2):
         # a wave of this length, running in this direction
         length, angle = rng.uniform(150, 400), rng.uniform(0, _TWO_PI)
         number = _TWO_PI / length
-        waves.append(
-            (
-                float(rng.uniform(0.3, 0.8)),
-                float(number * np.cos(angle)),
-                float(number * np.sin(angle)),
-                float(rng.uniform(0, _TWO_PI)),
-            )
-        )
+        amplitude, wave_x, wave_y = rng.uniform(0.3, 0.8), number * np.cos(angle), number * np.sin(angle)
+        waves.append((float(amplitude), float(wave_x), float(wave_y), float(rng.uniform(0, _TWO_PI))))
     angle, steepness = rng.uniform(0, _TWO_PI), rng.uniform(0, 0.006)
     return Ground(base_m, (float(steepness * np.cos(angle)), float(steepness * np.sin(angle))), tuple(waves))

@@ -14,7 +14,7 @@ from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
 from rlftsim.scenario.types import ObjectType
 
 CLEAR_AT_JUNCTION_M = 12.0
-_KINDS, _PROBABILITIES = ("car", "suv", "van"), (0.66, 0.29, 0.05)
+_CARS, _PROBABILITIES = ("car", "suv", "van"), (0.66, 0.29, 0.05)
 
 
 def _parked(position: np.ndarray, heading: float, size: tuple[float, float, float], num_steps: int) -> Body:
@@ -33,32 +33,32 @@ def _parked(position: np.ndarray, heading: float, size: tuple[float, float, floa
 
 def _draw_car(rng: np.random.Generator) -> tuple[float, float, float]:
     """Length, width and height of a car, SUV or van."""
-    return draw_size(rng, str(rng.choice(_KINDS, p=_PROBABILITIES)))
+    return draw_size(rng, str(rng.choice(_CARS, p=_PROBABILITIES)))
 
 
-def park_along(
+def park_in_strip(
     rng: np.random.Generator, line: Float[np.ndarray, "n 2"], occupancy: float, num_steps: int
 ) -> list[Body]:
     """Cars one behind another along a parking strip.
 
     Args:
-        rng: source of all choices.
-        line: center line of the strip.
-        occupancy: fraction of the places that is taken.
-        num_steps: length of the recording.
+        rng: Generator of all choices; also free spaces draw a car.
+        line: Center line of the strip, n points in driving direction, m.
+        occupancy: Probability in [0, 1] that a space has a car.
+        num_steps: Length of the recording in steps of 0.1 s.
     """
     points = resample(line)
     spacing = float(np.linalg.norm(points[1] - points[0]))
-    cars, at = [], CLEAR_AT_JUNCTION_M
+    cars, start = [], CLEAR_AT_JUNCTION_M
     while True:
         size = _draw_car(rng)
-        place = at + size[0] / 2
-        at += size[0] + rng.uniform(0.6, 1.6)
-        if at > (len(points) - 1) * spacing - CLEAR_AT_JUNCTION_M:
+        middle = start + size[0] / 2
+        start += size[0] + rng.uniform(0.6, 1.6)
+        if start > (len(points) - 1) * spacing - CLEAR_AT_JUNCTION_M:
             return cars
         if rng.random() >= occupancy:
             continue
-        index = min(int(place / spacing), len(points) - 2)
+        index = min(int(middle / spacing), len(points) - 2)
         tangent = points[index + 1] - points[index]
         heading = float(np.arctan2(tangent[1], tangent[0])) + rng.normal(0, 0.02)
         lateral = np.clip(rng.normal(0, 0.08), -0.15, 0.15)
@@ -67,30 +67,30 @@ def park_along(
 
 
 def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -> list[Body]:
-    """Cars in all parking strips of a network; every street has its own occupancy.
+    """Cars in all parking strips of a network; occupancy is drawn for every street.
 
     Args:
-        rng: source of all choices.
-        network: compiled network.
-        num_steps: length of the recording.
+        rng: Generator of all choices; the order of lanes decides the draws.
+        network: Compiled network with lanes of the type "parking".
+        num_steps: Length of the recording in steps of 0.1 s.
     """
     cars = []
     for lane in network.lanes.values():
-        if lane.kind == "parking":
-            cars += park_along(rng, lane.shape, float(rng.uniform(0.25, 0.9)), num_steps)
+        if lane.lane_type == "parking":
+            cars += park_in_strip(rng, lane.shape, float(rng.uniform(0.25, 0.9)), num_steps)
     return cars
 
 
-def _row_of_places(
+def _draw_row(
     rng: np.random.Generator, street: Street, setback_m: float, square: bool
 ) -> list[tuple[Float[np.ndarray, "2"], float]]:
-    """Places of one row beside a street: position and heading."""
+    """Positions and headings of the cars in a row beside a street."""
     border = offset_polyline(resample(street.points, 4.0), -(street.roadway_width_m + setback_m))
     points = resample(border)
     pitch = rng.uniform(2.7, 3.0) if square else rng.uniform(6.0, 6.8)
     count = int(rng.integers(5, 16)) if square else int(rng.integers(3, 8))
     first = rng.uniform(8, max(9.0, len(points) * 0.5 - count * pitch))
-    places = []
+    poses = []
     for k in range(count):
         index = int((first + k * pitch) / 0.5)
         if index >= len(points) - 2:
@@ -99,28 +99,28 @@ def _row_of_places(
         heading = float(np.arctan2(tangent[1], tangent[0]))
         if square:
             heading += np.pi / 2 if rng.random() < 0.7 else -np.pi / 2
-        places.append((points[index], heading))
-    return places
+        poses.append((points[index], heading))
+    return poses
 
 
 def park_in_lots(
     rng: np.random.Generator, network: Network, drivable: Any, num_steps: int, lots_per_street: float
 ) -> list[Body]:
-    """Rows of parked cars 8-25 m beside the streets, away from every roadway and from one another.
+    """Rows of parked cars 8-25 m beside the streets, clear of every roadway and of earlier cars.
 
     Args:
-        rng: source of all choices.
-        network: compiled network.
-        drivable: its drivable area as a shapely geometry.
-        num_steps: length of the recording.
-        lots_per_street: mean number of lots beside a direction of a street.
+        rng: Generator of all choices; rejected cars are drawn, too.
+        network: Compiled network whose streets have the lots.
+        drivable: Drivable area of the network as a shapely geometry.
+        num_steps: Length of the recording in steps of 0.1 s.
+        lots_per_street: Mean number of lots beside a direction of a street.
     """
     import shapely
 
     # prepared: thousands of points are tested against one large area
     shapely.prepare(near_road := drivable.buffer(5.5))
     cars: list[Body] = []
-    taken: list[np.ndarray] = []
+    positions: list[np.ndarray] = []
     for street in network.plan.streets:
         for _ in range(int(rng.poisson(lots_per_street))):
             occupancy, square = rng.uniform(0.3, 0.95), bool(rng.random() < 0.75)
@@ -128,29 +128,29 @@ def park_in_lots(
             # square to the street a row is as deep as a car is long
             rows = [setback, setback + (rng.uniform(5.6, 6.2) if square else rng.uniform(8, 10))]
             for row in rows[: int(rng.integers(1, 3))]:
-                for place, heading in _row_of_places(rng, street, row, square):
-                    # drawn before the place is judged: a place that is refused must not change the cars after it
+                for position, heading in _draw_row(rng, street, row, square):
+                    # drawn before the position is judged: a rejected position must not change the next cars
                     size = _draw_car(rng)
                     clear = 2.6 if square else 6.0
-                    if rng.random() >= occupancy or shapely.intersects_xy(near_road, *place):
+                    if rng.random() >= occupancy or shapely.intersects_xy(near_road, *position):
                         continue
-                    if taken and np.min(np.linalg.norm(np.array(taken) - place, axis=1)) < clear:
+                    if positions and np.min(np.linalg.norm(np.array(positions) - position, axis=1)) < clear:
                         continue
-                    taken.append(place)
-                    wobble = place + rng.normal(0, 0.1, 2)
+                    positions.append(position)
+                    wobble = position + rng.normal(0, 0.1, 2)
                     cars.append(_parked(wobble, heading + rng.normal(0, 0.03), size, num_steps))
     return drop_overlapping(cars)
 
 
 def drop_overlapping(cars: list[Body]) -> list[Body]:
-    """Cars in order, without those whose box meets an earlier one's."""
+    """Cars in order, without cars whose box meets the box of an earlier car."""
     if not cars:
         return []
     position, size = np.stack([car.position[0] for car in cars]), np.array([car.size for car in cars])
     heading = np.array([car.heading[0] for car in cars])
-    kept: list[int] = []
+    indices: list[int] = []
     for k in range(len(cars)):
-        gap = position[kept] - position[k]
-        if not boxes_overlap(gap, heading[k : k + 1], heading[kept], size[k], size[kept]).any():
-            kept.append(k)
-    return [cars[k] for k in kept]
+        gap = position[indices] - position[k]
+        if not boxes_overlap(gap, heading[k : k + 1], heading[indices], size[k], size[indices]).any():
+            indices.append(k)
+    return [cars[k] for k in indices]

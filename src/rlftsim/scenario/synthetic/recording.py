@@ -1,12 +1,10 @@
 """SUMO's output files read back: bodies of all road users, states of all lights."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow.csv
-from jaxtyping import Float
 
 from rlftsim.scenario.synthetic.bodies import Body, BumperPath, build_pedestrian, build_vehicle
 from rlftsim.scenario.synthetic.demand import RoadUserType, draw_size
@@ -24,50 +22,14 @@ Lanes that follow one another may not quite meet: bicycles keep right in a car's
 LONGEST_EVALUATED_M = 7.0
 
 
-class _LaneRuler:
-    """Points and directions at SUMO's positions along lanes, with the lengths measured once."""
-
-    def __init__(self, lanes: dict[str, Lane]) -> None:
-        self._lanes = lanes
-        self._along: dict[str, np.ndarray] = {}
-
-    def points_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Points on a lane's center line.
-
-        Args:
-            lane_id: a compiled lane.
-            positions_m: of SUMO, which count the lane's nominal length, not that of its shape.
-        """
-        lane = self._lanes[lane_id]
-        if lane_id not in self._along:
-            steps = np.linalg.norm(np.diff(lane.shape, axis=0), axis=1)
-            self._along[lane_id] = np.append(0.0, np.cumsum(steps))
-        along = self._along[lane_id]
-        at = positions_m * (along[-1] / max(lane.length_m, 1e-3))
-        return np.stack([np.interp(at, along, lane.shape[:, k]) for k in range(2)], axis=1)
-
-    def directions_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Unit tangents of a lane's center line over one meter.
-
-        Args:
-            lane_id: a compiled lane.
-            positions_m: of SUMO, as in `points_at`.
-        """
-        length = self._lanes[lane_id].length_m
-        reach = min(0.5, 0.4 * length)
-        middle = np.clip(positions_m, reach, max(length - reach, reach))
-        delta = self.points_at(lane_id, middle + reach) - self.points_at(lane_id, middle - reach)
-        return delta / np.maximum(np.linalg.norm(delta, axis=1, keepdims=True), 1e-9)
-
-
-def _read_table(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray] | None:
-    """Columns of a trajectory file; None where SUMO has written none, because there was nothing to write."""
+def _read_table(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray] | None:
+    """Columns of a trajectory file; None where SUMO has written no file or no rows."""
     if not path.exists():
         return None
     table = pyarrow.csv.read_csv(path, parse_options=pyarrow.csv.ParseOptions(delimiter=";"))
-    if not set(wanted) <= set(table.column_names) or table.num_rows == 0:
+    if not set(names) <= set(table.column_names) or table.num_rows == 0:
         return None
-    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in wanted}
+    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in names}
 
 
 def _runs_by_id(ids: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
@@ -78,24 +40,23 @@ def _runs_by_id(ids: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
     return [run for run in np.split(order, np.flatnonzero(new) + 1) if len(run) >= MIN_STEPS]
 
 
-def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> BumperPath:
-    """Bumper of one vehicle along lane centers, with the jumps between neighboring lanes listed as lane changes."""
+def _lane_path(lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> BumperPath:
+    """Bumper of a vehicle along lane centers, with the jumps between neighboring lanes listed as lane changes."""
     lane_ids, positions = rows["vehicle_lane"], rows["vehicle_pos"]
     center = np.empty((len(lane_ids), 2))
     direction = np.empty_like(center)
     starts = np.append(0, np.flatnonzero(lane_ids[1:] != lane_ids[:-1]) + 1)
     changes, distances = [], []
     for start, stop in zip(starts, np.append(starts[1:], len(lane_ids)), strict=True):
-        lane_id = str(lane_ids[start])
-        center[start:stop] = ruler.points_at(lane_id, positions[start:stop])
-        direction[start:stop] = ruler.directions_at(lane_id, positions[start:stop])
-        before = lanes[str(lane_ids[start - 1])] if start else None
-        now = lanes[lane_id]
-        if before is None:
+        lane = lanes[str(lane_ids[start])]
+        center[start:stop] = lane.points_at(positions[start:stop])
+        direction[start:stop] = lane.directions_at(positions[start:stop])
+        if start == 0:
             continue
+        last_lane = lanes[str(lane_ids[start - 1])]
         # Side by side, the jump is measured at one position; through a junction the two lanes have none in common.
-        if before.street is not None and before.street is now.street:
-            jump = center[start] - ruler.points_at(before.lane_id, positions[start : start + 1])[0]
+        if last_lane.street is not None and last_lane.street is lane.street:
+            jump = center[start] - last_lane.points_at(positions[start : start + 1])[0]
         else:
             jump = center[start] - center[start - 1]
         left_m = float(jump @ np.array([-direction[start, 1], direction[start, 0]]))
@@ -109,28 +70,28 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
     """Bodies of all motor vehicles and bicycles.
 
     Args:
-        path: trajectory file of the vehicles.
-        network: compiled network.
-        types: by type id.
-        rng: source of heights and of the drivers' habits.
+        path: Trajectory file of the vehicles, CSV; without a file there are no vehicles.
+        network: Compiled network; states off the lanes are left out.
+        types: Vehicle types by type id, as `write_demand` returns them.
+        rng: Generator of heights and of the drivers' habits.
     """
     names = ("timestep_time", "vehicle_id", "vehicle_type", "vehicle_speed", "vehicle_pos", "vehicle_lane")
     table = _read_table(path, names)
     if table is None:
         return []
-    known = np.array([lane in network.lanes for lane in table["vehicle_lane"]])
-    table = {name: column[known] for name, column in table.items()}
+    is_on_lane = np.array([lane in network.lanes for lane in table["vehicle_lane"]])
+    table = {name: column[is_on_lane] for name, column in table.items()}
     step = np.rint((table["timestep_time"] - DISCARDED_S) / STEP_S).astype(int)
-    ruler = _LaneRuler(network.lanes)
     bodies = []
     for run in _runs_by_id(table["vehicle_id"], step):
-        kind = types[str(table["vehicle_type"][run[0]])]
-        lane_path = _lane_path(ruler, network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
+        user_type = types[str(table["vehicle_type"][run[0]])]
+        lane_path = _lane_path(network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
         # a type has one size for SUMO; heights may differ, because SUMO does not know them
-        height = kind.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
+        height = user_type.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
         habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))
-        size = (kind.length_m, kind.width_m, height)
-        bodies.append(build_vehicle(lane_path, kind.object_type, size, habit, kind.length_m <= LONGEST_EVALUATED_M))
+        size = (user_type.length_m, user_type.width_m, height)
+        is_evaluable = user_type.length_m <= LONGEST_EVALUATED_M
+        bodies.append(build_vehicle(lane_path, user_type.object_type, size, habit, is_evaluable))
     return bodies
 
 
@@ -138,8 +99,8 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
     """Bodies of all pedestrians.
 
     Args:
-        path: trajectory file of the persons.
-        rng: source of their sizes.
+        path: Trajectory file of the persons, CSV; without a file there are no pedestrians.
+        rng: Generator of the pedestrians' sizes.
     """
     names = ("timestep_time", "person_id", "person_x", "person_y", "person_angle")
     table = _read_table(path, names)
@@ -158,24 +119,11 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
-@dataclass(frozen=True, eq=False)
-class SignalStates:
-    """SUMO's letters of all links of one junction, one string per simulated step."""
-
-    junction: str
-    states: tuple[str, ...]
-
-    def has_protected_phase(self, link_index: int) -> bool:
-        """True if the link may go with right of way (G) in one phase and without it (g) in another."""
-        return {"G", "g"} <= {state[link_index] for state in self.states}
-
-
-def read_signals(path: Path, junction: str) -> SignalStates:
-    """Signal states of a junction from the first simulated step on.
+def read_signals(path: Path) -> tuple[str, ...]:
+    """Letters of SUMO for all links of a junction, a text per simulated step from the first on.
 
     Args:
-        path: file of the junction's states.
-        junction: its id.
+        path: File with the junction's signal states, XML of SUMO.
     """
-    found = re.findall(r'time="([\d.]+)"[^>]*state="([^"]*)"', path.read_text())
-    return SignalStates(junction, tuple(state for time, state in found if float(time) >= DISCARDED_S - 1e-6))
+    entries = re.findall(r'time="([\d.]+)"[^>]*state="([^"]*)"', path.read_text())
+    return tuple(state for time, state in entries if float(time) >= DISCARDED_S - 1e-6)

@@ -1,18 +1,19 @@
 """Street plans drawn from a seed, before any simulator is involved.
 
-A plan is a list of nodes and *directed* streets in meters around (0, 0). The shape of a street is its left border (the
-line between the two directions). Its lanes lie to the right of it and are listed from right to left, as SUMO counts.
+A plan is a list of nodes and *directed* streets in meters around (0, 0). The shape of a street is the left border (the
+line between the two directions). Lanes lie to the right of the border and are listed from right to left, as SUMO
+counts.
 """
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-LaneKind = Literal["sidewalk", "gutter", "parking", "bicycle", "travel"]
-"""A gutter is the pavement between the outermost usable lane and the road edge. Nothing drives on it."""
+LaneType = Literal["sidewalk", "gutter", "parking", "bicycle", "travel"]
+"""A gutter is the pavement between the outermost usable lane and the road edge. No vehicle drives on a gutter."""
 Control = Literal["traffic_light", "allway_stop", "priority_stop", "right_before_left", "priority", "dead_end"]
 StreetClass = Literal["arterial", "collector", "residential", "freeway", "ramp"]
 
@@ -26,7 +27,7 @@ PRIORITY: Mapping[StreetClass, int] = {"freeway": 12, "ramp": 8, "arterial": 9, 
 class PlannedLane:
     """One lane of a street."""
 
-    kind: LaneKind
+    lane_type: LaneType
     width_m: float
 
 
@@ -55,17 +56,17 @@ class Street:
     speed_mps: float
     priority: int
     reverse_id: str | None = None
-    """The opposite direction sharing the left border; None beside a median or where there is none."""
+    """The opposite direction sharing the left border; None beside a median or on a one-way street."""
 
     @property
     def roadway_width_m(self) -> float:
         """Width of all lanes but sidewalks."""
-        return sum(lane.width_m for lane in self.lanes if lane.kind != "sidewalk")
+        return sum(lane.width_m for lane in self.lanes if lane.lane_type != "sidewalk")
 
 
 @dataclass(frozen=True)
 class Connection:
-    """Explicit link between lanes; a plan without any leaves them to the network compiler."""
+    """Explicit link between lanes; a plan without connections leaves the links to the network compiler."""
 
     from_street: str
     to_street: str
@@ -75,9 +76,9 @@ class Connection:
 
 @dataclass(frozen=True, eq=False)
 class StreetPlan:
-    """Everything the network compiler needs, and the kinds of lanes and the tapers, which it would lose."""
+    """Input of the network compiler, and the types of lanes and the tapers, which the compiler would lose."""
 
-    kind: Literal["city", "quiet", "freeway"]
+    network_type: Literal["city", "quiet", "freeway"]
     nodes: tuple[Node, ...]
     streets: tuple[Street, ...]
     connections: tuple[Connection, ...] = ()
@@ -94,15 +95,35 @@ def offset_polyline(points: Float[np.ndarray, "n 2"], left_m: float) -> Float[np
     """Polyline moved sideways, corners mitered up to twice the distance.
 
     Args:
-        points: the polyline.
-        left_m: distance to the left in meters; negative = to the right.
+        points: Polyline with n points, m, in driving direction.
+        left_m: Distance to the left in meters; negative = to the right.
     """
     delta = np.diff(points, axis=0)
     delta /= np.maximum(np.linalg.norm(delta, axis=1, keepdims=True), 1e-9)
     normal = np.stack([-delta[:, 1], delta[:, 0]], axis=1)
-    before = np.concatenate([normal[:1], normal])
-    after = np.concatenate([normal, normal[-1:]])
-    bisector = before + after
+    first_normal = np.concatenate([normal[:1], normal])  # of the segment that ends at a point
+    bisector = first_normal + np.concatenate([normal, normal[-1:]])
     # the bisector is 2 cos(turn / 2) long, its product with a normal 2 cos(turn / 2)^2: corners keep their distance
-    scale = np.maximum((bisector * before).sum(1, keepdims=True), 0.5)
+    scale = np.maximum((bisector * first_normal).sum(1, keepdims=True), 0.5)
     return points + left_m * bisector / scale
+
+
+def rotation_matrix(angle_rad: float) -> Float[np.ndarray, "2 2"]:
+    """Matrix that turns column vectors counter-clockwise."""
+    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+
+
+def find_reachable(start: Hashable, links: Sequence[tuple[Hashable, Hashable]]) -> set[Hashable]:
+    """Nodes that links lead to from a node, the start included.
+
+    Args:
+        start: Node where the search begins.
+        links: Pairs of nodes, each passable from the first to the second node only.
+    """
+    reachable, frontier = set(), [start]
+    while frontier:
+        node = frontier.pop()
+        if node not in reachable:
+            reachable.add(node)
+            frontier += [target for source, target in links if source == node]
+    return reachable

@@ -1,4 +1,4 @@
-"""SUMO as a subprocess: compile a street plan, route demand, simulate. Nothing of SUMO is imported here."""
+"""SUMO as a subprocess: compile a street plan, route demand, simulate. SUMO is not imported."""
 
 import importlib.util
 import re
@@ -27,9 +27,9 @@ def find_binary(name: str) -> Path:
     """Path of `netconvert`, `duarouter` or `sumo` inside the installed `sumo` package; PATH is ignored.
 
     Raises:
-        ConfigError: the extra `synthetic` is not installed.
+        ConfigError: The extra `synthetic` is not installed.
     """
-    # find_spec does not import the package: nothing of SUMO runs in this process
+    # find_spec does not import the package: SUMO does not run in this process
     package = importlib.util.find_spec("sumo")
     if package is None or not package.submodule_search_locations:
         raise ConfigError(INSTALL_HINT)
@@ -43,13 +43,13 @@ def find_binary(name: str) -> Path:
 def sumo_version() -> str:
     """Version such as "1.28.0"; other versions make other traffic."""
     output = subprocess.run([find_binary("sumo"), "--version"], capture_output=True, text=True, check=True).stdout
-    found = re.search(r"(\d+\.\d+\.\d+)", output)
-    return found.group(1) if found else "unknown"
+    version = re.search(r"(\d+\.\d+\.\d+)", output)
+    return version.group(1) if version else "unknown"
 
 
 def _run(name: str, *options: object) -> None:
-    """Run a program of SUMO; its last line of standard error is the reason if it fails."""
-    # no standard input: a program that asks something fails at once instead of waiting
+    """Run a program of SUMO; the last line of standard error is the reason of a failure."""
+    # no standard input: a program that asks a question fails at once instead of waiting
     command = [str(find_binary(name)), *(str(option) for option in options)]
     done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     if done.returncode != 0:
@@ -68,10 +68,10 @@ def _edges_xml(plan: StreetPlan) -> str:
             f'spreadType="right" shape="{shape}">'
         )
         for index, lane in enumerate(street.lanes):
-            allowed = _ALLOWED.get(lane.kind)
-            if lane.kind == "travel" and street.street_class == "residential":
+            allowed = _ALLOWED.get(lane.lane_type)
+            if lane.lane_type == "travel" and street.street_class == "residential":
                 allowed = _VEHICLES.replace("bus truck ", "")  # long vehicles would cut the corners of narrow streets
-            if lane.kind == "travel" and street.street_class in ("freeway", "ramp"):
+            if lane.lane_type == "travel" and street.street_class in ("freeway", "ramp"):
                 allowed = _VEHICLES.replace(" bicycle", "")
             permission = f'allow="{allowed}"' if allowed else 'disallow="all"'
             rows.append(f'    <lane index="{index}" width="{lane.width_m:.2f}" {permission}/>')
@@ -80,19 +80,19 @@ def _edges_xml(plan: StreetPlan) -> str:
 
 
 def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposites") -> Path:
-    """Write the plan as plain XML into `folder` and compile it.
+    """Write the plan as plain XML into `folder` and compile the network.
 
     Args:
-        plan: streets to build.
-        folder: existing working folder.
-        signal_layout: `opposites` or `incoming`, which approaches share a green.
+        plan: Street plan with nodes, streets and connections.
+        folder: Existing working folder; files of the same names are replaced.
+        signal_layout: Approaches that share a green: `opposites` or `incoming`.
 
     Returns:
         Path of the network file.
     """
     nodes = [
         f'  <node id="{node.node_id}" x="{node.position[0]:.3f}" y="{node.position[1]:.3f}" type="{node.control}"'
-        + (' radius="7"/>' if plan.kind != "freeway" else "/>")
+        + (' radius="7"/>' if plan.network_type != "freeway" else "/>")
         for node in plan.nodes
     ]
     (folder / "plan.nod.xml").write_text("\n".join(["<nodes>", *nodes, "</nodes>"]))
@@ -107,7 +107,7 @@ def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposi
         (folder / "plan.con.xml").write_text("\n".join(["<connections>", *links, "</connections>"]))
         options += ["--connection-files", folder / "plan.con.xml"]
     # pedestrians cross wherever cars drive slowly enough
-    if plan.kind != "freeway":
+    if plan.network_type != "freeway":
         options += ["--crossings.guess", "--crossings.guess.speed-threshold", 22, "--walkingareas"]
     network = folder / "network.net.xml"
     _run(
@@ -125,9 +125,9 @@ def route_demand(network: Path, demand: Path, seed: int) -> Path:
     """Give every trip a route and drop the impossible ones, which would block a lane forever.
 
     Args:
-        network: compiled network.
-        demand: types, trips and walks.
-        seed: of SUMO's own choices.
+        network: Network file of `compile_network`.
+        demand: File with types, trips and walks; the routes are written to the same folder.
+        seed: Seed of SUMO's random choices.
 
     Returns:
         Path of the routes.
@@ -144,10 +144,10 @@ def simulate(network: Path, routes: Path, additional: Path, seed: int) -> tuple[
     """Simulate `SIMULATED_S` seconds at 10 Hz; the first `DISCARDED_S` are not written.
 
     Args:
-        network: compiled network; SUMO writes into its folder.
-        routes: file of `route_demand`.
-        additional: further instructions for SUMO.
-        seed: of SUMO's own choices.
+        network: Network file of `compile_network`; SUMO writes into the same folder.
+        routes: File of `route_demand` with a route for each trip.
+        additional: File with further instructions for SUMO, such as the signals to record.
+        seed: Seed of SUMO's random choices.
 
     Returns:
         CSV files of the vehicles and of the pedestrians (the latter may not exist).

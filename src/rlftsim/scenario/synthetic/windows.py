@@ -18,7 +18,6 @@ from rlftsim.scenario.synthetic.gates import (
     compute_overlap_s,
     moves_plausibly,
 )
-from rlftsim.scenario.synthetic.recording import SignalStates
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     STEP_S,
@@ -55,12 +54,13 @@ _LIGHT_STATES = {
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A simulated network with its traffic, from which windows are cut."""
+    """A simulated network with traffic, from which windows are cut."""
 
     name: str
     bodies: tuple[Body, ...]
     cropper: MapCropper
-    signals: dict[str, SignalStates]
+    signals: dict[str, tuple[str, ...]]
+    """Letters of SUMO for all links of each junction, a text per step."""
     ends: Float[np.ndarray, "n 2"]
     """Positions of the network's ends."""
     num_steps: int
@@ -68,7 +68,7 @@ class World:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Bodies seen in a window; arrays over its 91 steps, zero where a body does not exist."""
+    """Bodies seen in a window; arrays over the 91 steps, zero where a body does not exist."""
 
     bodies: list[Body]
     position: Float[np.ndarray, "o 91 2"]
@@ -79,58 +79,58 @@ class _View:
     @property
     def traveled_m(self) -> Float[np.ndarray, "o"]:
         """Distance driven while valid."""
-        both = self.valid[:, 1:] & self.valid[:, :-1]
-        return (np.linalg.norm(np.diff(self.position, axis=1), axis=-1) * both).sum(axis=1)
+        is_valid = self.valid[:, 1:] & self.valid[:, :-1]
+        return (np.linalg.norm(np.diff(self.position, axis=1), axis=-1) * is_valid).sum(axis=1)
 
 
 def _look(bodies: list[Body], start: int, ego: Body, range_m: float, rng: np.random.Generator) -> _View:
     """All bodies the ego sees at any step of the window; the ego comes last."""
     ego_slice = slice(start - ego.first_step, start - ego.first_step + TOTAL_STEPS)
     ego_path = ego.position[ego_slice]  # [91, 2]
-    kept, arrays = [], []
-    for body in [*(other for other in bodies if other is not ego), ego]:
+    visible_bodies, arrays = [], []
+    for body in [*(candidate for candidate in bodies if candidate is not ego), ego]:
         # 1. Steps [first, last) of the window in which the body exists, and the same steps of the body's own life.
         first = max(0, body.first_step - start)
         last = min(TOTAL_STEPS, body.first_step + body.num_steps - start)
         if last <= first:
             continue
         index = start + first - body.first_step
-        own = slice(index, index + last - first)
+        span = slice(index, index + last - first)
 
         # 2. Steps at which the ego sees it.
-        distance = np.linalg.norm(body.position[own] - ego_path[first:last], axis=1)
+        distance = np.linalg.norm(body.position[span] - ego_path[first:last], axis=1)
         if distance.min() > range_m:
             continue
-        seen = np.ones(TOTAL_STEPS, bool)
+        is_visible = np.ones(TOTAL_STEPS, bool)
         if body is not ego:
-            seen = distance < range_m
+            is_visible = distance < range_m
             # now and then a spell behind something, the more likely the farther away
             if rng.random() < 0.5 * np.clip(distance.mean() / range_m, 0.0, 1.0):
                 begin = int(rng.integers(-20, TOTAL_STEPS))
-                seen[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
-        if not seen.any():
+                is_visible[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
+        if not is_visible.any():
             continue
 
         # 3. Its states, where it exists; `valid` where it is seen.
         position, heading = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS)
         velocity, valid = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS, bool)
-        position[first:last], heading[first:last] = body.position[own], body.heading[own]
-        velocity[first:last], valid[first:last] = body.velocity[own], seen
-        kept.append(body)
+        position[first:last], heading[first:last] = body.position[span], body.heading[span]
+        velocity[first:last], valid[first:last] = body.velocity[span], is_visible
+        visible_bodies.append(body)
         arrays.append((position, heading, velocity, valid))
-    return _View(kept, *(np.stack(column) for column in zip(*arrays, strict=True)))
+    return _View(visible_bodies, *(np.stack(column) for column in zip(*arrays, strict=True)))
 
 
 def _passes_gates(view: _View, rng: np.random.Generator) -> bool:
-    """True for a window with enough motion, in which all bodies move and keep apart like real ones."""
+    """True for a window with enough motion, in which all bodies move and keep apart like real road users."""
     moving = view.traveled_m > 1.0  # [o]
     if moving.sum() < MIN_MOVING_AGENTS:
         return False
     if not moving[-1] and rng.random() >= 0.15:  # few scenarios with an ego that stands
         return False
     for index in np.flatnonzero(moving):
-        seen = np.flatnonzero(view.valid[index])
-        span = slice(seen[0], seen[-1] + 1)  # also where it is hidden for a while
+        valid_steps = np.flatnonzero(view.valid[index])
+        span = slice(valid_steps[0], valid_steps[-1] + 1)  # also where it is hidden for a while
         is_vehicle = view.bodies[index].object_type != ObjectType.PEDESTRIAN
         if not moves_plausibly(view.position[index, span], view.heading[index, span], is_vehicle):
             return False
@@ -141,7 +141,7 @@ def _passes_gates(view: _View, rng: np.random.Generator) -> bool:
 
 
 def _is_on_road(view: _View, index: int, drivable: Any) -> bool:
-    """True for a vehicle that keeps to the drivable area, and for everything that is no vehicle."""
+    """True for a vehicle that stays in the drivable area, and for bodies of other types."""
     body, valid = view.bodies[index], view.valid[index]
     if body.object_type != ObjectType.VEHICLE:
         return True
@@ -150,78 +150,69 @@ def _is_on_road(view: _View, index: int, drivable: Any) -> bool:
 
 
 def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: Any) -> list[int]:
-    """2 to 8 tracks, far-traveling ones first, pedestrians and cyclists preferred; in half of the sets one that stands.
+    """2 to 8 tracks, far-traveling ones first, pedestrians and cyclists preferred; in half of the sets a standing one.
 
     Args:
-        view: a window; the ego is its last body.
-        rng: source of all choices.
-        drivable: drivable area as a shapely geometry.
+        view: Window whose last body is the ego.
+        rng: Generator of all choices; the order of bodies decides the draws.
+        drivable: Drivable area of the network as a shapely geometry.
     """
     # 1. Candidates: seen now and mostly later, near the ego.
     future = slice(CURRENT_STEP + 1, None)
-    ego_now = view.position[-1, CURRENT_STEP]
+    ego_position = view.position[-1, CURRENT_STEP]
     candidates = [
         k
         for k, body in enumerate(view.bodies[:-1])
         if body.is_evaluable
         and view.valid[k, CURRENT_STEP]
         and view.valid[k, future].mean() >= 0.7
-        and np.linalg.norm(view.position[k, CURRENT_STEP] - ego_now) < PREDICT_WITHIN_M
+        and np.linalg.norm(view.position[k, CURRENT_STEP] - ego_position) < PREDICT_WITHIN_M
         and not (body.object_type == ObjectType.VEHICLE and rng.random() < 0.1)
     ]
     # 2. Their order: by distance traveled with some noise.
     traveled = np.minimum(view.traveled_m, 40.0)
-    rank = {
-        k: traveled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.0) + rng.normal(0, 8.0)
-        for k in candidates
-    }
-    wanted = int(rng.choice([2, 3, 4, 5, 6, 7, 8], p=[0.14, 0.18, 0.2, 0.16, 0.13, 0.1, 0.09]))
+    is_vehicle = [body.object_type == ObjectType.VEHICLE for body in view.bodies]
+    rank = {k: traveled[k] * (1.0 if is_vehicle[k] else 2.0) + rng.normal(0, 8.0) for k in candidates}
+    num_tracks = int(rng.choice([2, 3, 4, 5, 6, 7, 8], p=[0.14, 0.18, 0.2, 0.16, 0.13, 0.1, 0.09]))
     moving = sorted((k for k in candidates if traveled[k] > 1.0), key=lambda k: -rank[k])
     standing = [k for k in candidates if traveled[k] <= 1.0]
     order = ([standing[0]] if standing and rng.random() < 0.5 else []) + moving + standing
     # 3. The first ones that are on the road, not too many pedestrians among them.
-    chosen: list[int] = []
+    tracks: list[int] = []
     pedestrians = 0
     for k in dict.fromkeys(order):
         is_pedestrian = view.bodies[k].object_type == ObjectType.PEDESTRIAN
-        if len(chosen) == wanted or (is_pedestrian and pedestrians == MAX_PREDICTED_PEDESTRIANS):
+        if len(tracks) == num_tracks or (is_pedestrian and pedestrians == MAX_PREDICTED_PEDESTRIANS):
             continue
         if _is_on_road(view, k, drivable):
-            chosen.append(k)
+            tracks.append(k)
             pedestrians += is_pedestrian
-    return sorted(chosen)
+    return sorted(tracks)
 
 
 def _observe_lights(
     world: World, features: MapFeatures, start: int, ego_path: Float[np.ndarray, "n 2"], range_m: float
 ) -> LightStates:
     """State of every light whose lane begins within the range, per step."""
-    first_point = {
-        int(features.feature_id[k]): features.points[features.offsets[k]] for k in range(len(features.feature_id))
-    }
+    first_point = dict(zip(features.feature_id.tolist(), features.points[features.offsets[:-1]]))
     # 1. Lights that the ego ever comes near, and whose lane is not cut at its beginning.
-    seen = []
+    lights = []
     for junction, link, lane_id, direction in world.cropper.network_map.light_lanes:
         stop = world.cropper.network_map.features[lane_id - 1].points[0]
-        kept = first_point.get(lane_id)
-        if kept is None or np.linalg.norm(kept[:2] - stop) > 0.01:
+        stop_point = first_point.get(lane_id)
+        if stop_point is None or np.linalg.norm(stop_point[:2] - stop) > 0.01:
             continue
         if np.linalg.norm(ego_path - stop, axis=1).min() < range_m:
             # a left turn that has a phase of its own is shown by arrows
-            arrow = direction in "lL" and world.signals[junction].has_protected_phase(link)
-            seen.append((junction, link, lane_id, kept, arrow))
+            arrow = direction in "lL" and {"G", "g"} <= {state[link] for state in world.signals[junction]}
+            lights.append((junction, link, lane_id, stop_point, arrow))
     # 2. Their states, step by step.
-    rows = [
-        (step, lane_id, _LIGHT_STATES.get(world.signals[junction].states[start + step][link], _STOP)[arrow], stop)
-        for step in range(TOTAL_STEPS)
-        for junction, link, lane_id, stop, arrow in seen
-    ]
-    return LightStates(
-        step=np.array([row[0] for row in rows], np.int32),
-        lane_id=np.array([row[1] for row in rows], np.int64),
-        state=np.array([row[2] for row in rows], np.int8),
-        stop_point=np.array([row[3] for row in rows], np.float32).reshape(-1, 3),
-    )
+    rows = []
+    for step in range(TOTAL_STEPS):
+        for junction, link, lane_id, stop, arrow in lights:
+            letter = world.signals[junction][start + step][link]
+            rows.append((step, lane_id, _LIGHT_STATES.get(letter, _STOP)[arrow], *stop))
+    return LightStates.of(rows)
 
 
 def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
@@ -236,16 +227,11 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
     z = world.cropper.ground.height_at(position) + size[:, None, 2] / 2
     heading = np.arctan2(np.sin(heading), np.cos(heading))
     valid = view.valid
+    xy = on_grid(position * valid[..., None], POSITION_GRID_PER_M)
     return Tracks(
         object_id=np.cumsum(rng.integers(1, 9, len(view.bodies))).astype(np.int64),
         object_type=np.array([body.object_type for body in view.bodies], np.int8),
-        position=np.concatenate(
-            [
-                on_grid(position * valid[..., None], POSITION_GRID_PER_M),
-                on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None],
-            ],
-            axis=-1,
-        ),
+        position=np.concatenate([xy, on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None]], axis=-1),
         heading=on_grid(heading * valid, HEADING_GRID_PER_RAD),
         velocity=on_grid(velocity * valid[..., None], VELOCITY_GRID_PER_MPS),
         size=on_grid(size[:, None] * valid[..., None], SIZE_GRID_PER_M),
@@ -254,7 +240,7 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
 
 
 def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Body]:
-    """At most two egos of a window, far apart, so that their scenarios share little."""
+    """At most two egos of a window, far apart, so that the scenarios share little."""
     # 1. Cars that exist throughout the window and keep away from the network's ends; moving ones are preferred.
     candidates, weights = [], []
     for body in world.bodies:
@@ -274,23 +260,23 @@ def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Bod
     probabilities = np.array(weights) / np.sum(weights)
     order = rng.choice(len(candidates), len(candidates), replace=False, p=probabilities)
     first = candidates[order[0]]
-    now = start + CURRENT_STEP
+    current_step = start + CURRENT_STEP
     for index in order[1:]:
-        other = candidates[index]
-        gap = other.position[now - other.first_step] - first.position[now - first.first_step]
+        second = candidates[index]
+        gap = second.position[current_step - second.first_step] - first.position[current_step - first.first_step]
         if np.linalg.norm(gap) > EGO_TO_EGO_M:
-            return [first, other]
+            return [first, second]
     return [first]
 
 
 def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) -> Scenario | None:
-    """Scenario of one window as the ego sees it; None if it fails a gate.
+    """Scenario of a window from the ego's view; None if the window fails a gate.
 
     Args:
-        world: simulated network.
-        start: step of the recording at which the window begins.
-        ego: a body that exists throughout the window.
-        rng: source of all choices.
+        world: Simulated network with bodies, lights and map.
+        start: Step of the recording at which the window begins.
+        ego: Body that exists throughout the window.
+        rng: Generator of all choices; equal states give equal scenarios.
     """
     range_m = float(rng.uniform(65.0, 95.0))
     view = _look(list(world.bodies), start, ego, range_m, rng)
@@ -320,13 +306,13 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
 
 
 def cut_scenarios(world: World, rng: np.random.Generator) -> Iterator[Scenario]:
-    """Scenarios of a world in random order, without those that fail a gate.
+    """Scenarios of a world in random order, without windows that fail a gate.
 
-    No two of them overlap in time and place.
+    No two scenarios overlap in time and position.
 
     Args:
-        world: simulated network.
-        rng: source of all choices.
+        world: Simulated network with bodies, lights and map.
+        rng: Generator of all choices; equal states give equal scenarios.
     """
     starts = rng.permutation(np.arange(FIRST_START, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
     for start in starts.tolist():

@@ -21,23 +21,23 @@ LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
 _NUM_STEPS = round((sumo.SIMULATED_S - sumo.DISCARDED_S) / STEP_S)
 
 
-def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
-    """Draw a network, let SUMO fill it with traffic, and turn its output into bodies, lights and a map.
+def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> World:
+    """Draw a network, let SUMO fill it with traffic, and turn the output into bodies, lights and a map.
 
     Args:
-        kind: "city", "quiet" or "freeway".
-        seed: source of all choices; the same seed and version of SUMO give the same world.
-        folder: existing folder for SUMO's files.
+        network_type: Type of the network, "city", "quiet" or "freeway".
+        seed: Seed of all choices; the same seed and version of SUMO give the same world.
+        folder: Existing folder for SUMO's files; the caller deletes the files.
 
     Raises:
-        ConfigError: SUMO or shapely is not installed.
-        RlftsimError: a program of SUMO failed.
+        ConfigError: SUMO is not installed.
+        RlftsimError: A program of SUMO failed.
     """
-    # One generator for all steps: their order is part of what a seed means.
+    # One generator for all steps: the order of steps is part of a seed's meaning.
     rng = np.random.default_rng(seed)
 
     # 1. Streets.
-    plan = draw_freeway_plan(rng) if kind == "freeway" else draw_city_plan(rng, quiet=kind == "quiet")
+    plan = draw_freeway_plan(rng) if network_type == "freeway" else draw_city_plan(rng, quiet=network_type == "quiet")
     layout = "opposites" if rng.random() < 0.75 else "incoming"
     network_file = sumo.compile_network(plan, folder, layout)
     network = read_network(network_file, plan)
@@ -47,10 +47,7 @@ def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
     sumo_seed = int(rng.integers(1, 2**31 - 1))
     routes = sumo.route_demand(network_file, folder / "demand.xml", sumo_seed)
     signal_files = {junction: folder / f"signals_{junction}.xml" for junction in network.lights}
-    events = [
-        f'<timedEvent type="SaveTLSStates" source="{junction}" dest="{path}"/>'
-        for junction, path in signal_files.items()
-    ]
+    events = [f'<timedEvent type="SaveTLSStates" source="{k}" dest="{path}"/>' for k, path in signal_files.items()]
     additional = folder / "additional.xml"
     additional.write_text("\n".join(["<additional>", *events, "</additional>"]))
     vehicles_file, persons_file = sumo.simulate(network_file, routes, additional, sumo_seed)
@@ -60,12 +57,12 @@ def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
     bodies = read_vehicles(vehicles_file, network, types, rng)
     bodies += read_pedestrians(persons_file, rng)
     bodies += park_in_strips(rng, network, _NUM_STEPS)
-    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[kind])
+    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[network_type])
     return World(
         name="/".join(map(str, seed)),
         bodies=tuple(bodies),
-        cropper=MapCropper.of(network_map, draw_ground(rng)),
-        signals={junction: read_signals(path, junction) for junction, path in signal_files.items()},
+        cropper=MapCropper(network_map, draw_ground(rng)),
+        signals={junction: read_signals(path) for junction, path in signal_files.items()},
         ends=np.stack([node.position for node in plan.fringe_nodes]),
         num_steps=_NUM_STEPS,
     )

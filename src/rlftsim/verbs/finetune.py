@@ -9,7 +9,6 @@ from typing import Any
 
 from torch import nn
 
-from rlftsim._api.sources import policy_of, require_name
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.card import append_cards, model_card
@@ -25,25 +24,9 @@ from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.method import find_method
+from rlftsim.training.registry import find_method
 from rlftsim.training.run import train_policy
-
-
-def recipe(name: str) -> Any:
-    """Settings of every stage from vocabulary to fine-tuned policy.
-
-    Args:
-        name: "smart-tiny" (the paper), "smart-mini", "smart-nano", "smart-demo" (minutes on two CPU cores), or a
-            recipe of another package.
-
-    Returns:
-        A frozen dataclass with the sections tokens, model, pretrain, finetune, catk, gcsl and calibrate;
-        `dataclasses.replace` makes one with other values.
-
-    Raises:
-        ConfigError: no such recipe.
-    """
-    return recipe_by_name(require_name(name, "recipe", "smart-demo"))
+from rlftsim.verbs.inputs import to_policy
 
 
 def pretrain(
@@ -84,7 +67,7 @@ def pretrain(
         start: Any = policy.new_policy(vocabulary)
         card = _card("pre-trained", training)
     else:
-        start = policy_of(policy)
+        start = to_policy(policy)
         card = _card("pre-trained further", training, policy)
     settings = config or PretrainConfig()
     validation = None if held_out is None else to_scenarios(held_out)
@@ -127,7 +110,7 @@ def finetune(
         _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training, settings = to_scenarios(scenarios, "training"), config or FinetuneConfig()
     card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
-    start = prepare_policy(policy_of(policy), settings)
+    start = prepare_policy(to_policy(policy), settings)
     return _train_copy(start, out, lambda learner, folder: train_policy(learner, training, folder, settings, card=card))
 
 

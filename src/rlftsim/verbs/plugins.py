@@ -1,4 +1,4 @@
-"""The verb that lists plug-ins: plugins."""
+"""`rlftsim plugins`: what other packages add."""
 
 import importlib
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rlftsim.jobs.progress import print_wide
 POINTS = {
     "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
     "rlftsim.recipes": "rlftsim.recipes.registry:RECIPES",
-    "rlftsim.methods": "rlftsim.training.method:METHODS",
+    "rlftsim.methods": "rlftsim.training.registry:METHODS",
     "rlftsim.rewards": "rlftsim.rewards:REWARDS",
     "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
     "rlftsim.features": "rlftsim.policies.calibrated.features:FEATURES",
@@ -57,29 +57,24 @@ def list_plug_ins() -> list[PlugIn]:
     return plug_ins
 
 
-@dataclass(frozen=True)
-class Plugins:
-    """List what other installed packages add: rewards, policies, data sources, recipes, experiments, planners and
-    exporters, with package and version, and the reason where one fails. Each is tried out: policies, planners and
-    recipes are made.
+def plugins() -> int:
+    """List what other installed packages add, with package and version, and the reason where one fails.
 
-    Exit status 1 if one fails. The others are used all the same.
+    Each is tried out, of rewards, policies, data sources, recipes, experiments, planners and exporters: policies,
+    planners and recipes are made. The exit status is 1 if one fails. The others are used all the same.
     """
-
-    def run(self) -> int:
-        """Print the list."""
-        plug_ins = list_plug_ins()
-        if not plug_ins:
-            print(f"no installed package has an entry point in {', '.join(POINTS)}.")
-            return 0
-        table = Table()
-        for heading in ("group", "name", "package", "version", "object", "state"):
-            table.add_column(heading, overflow="fold")
-        for plug_in in plug_ins:
-            state = "fails" if plug_in.problem else "works"
-            table.add_row(plug_in.group, plug_in.name, plug_in.package, plug_in.version, plug_in.value, state)
-        print_wide(table)
-        problems = [plug_in.problem for plug_in in plug_ins if plug_in.problem]
-        for problem in problems:
-            print(problem)
-        return int(bool(problems))
+    plug_ins = list_plug_ins()
+    if not plug_ins:
+        print(f"no installed package has an entry point in {', '.join(POINTS)}.")
+        return 0
+    table = Table()
+    for heading in ("group", "name", "package", "version", "object", "state"):
+        table.add_column(heading, overflow="fold")
+    for plug_in in plug_ins:
+        state = "fails" if plug_in.problem else "works"
+        table.add_row(plug_in.group, plug_in.name, plug_in.package, plug_in.version, plug_in.value, state)
+    print_wide(table)
+    problems = [plug_in.problem for plug_in in plug_ins if plug_in.problem]
+    for problem in problems:
+        print(problem)
+    return int(bool(problems))

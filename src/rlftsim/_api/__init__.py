@@ -1,1 +1,0 @@
-"""Functions behind `import rlftsim as rs` that do more than pass a name on; use them from there."""

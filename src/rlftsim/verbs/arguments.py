@@ -1,0 +1,35 @@
+"""Types of arguments that several verbs share: values in Python, and what a command line takes in their place.
+
+`Annotated[Any, T]` is read as T on the command line, and stands for any value in Python. No torch is imported.
+"""
+
+import os
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rlftsim.evaluation.drive_results import DriveResult
+    from rlftsim.evaluation.results import Evaluation
+    from rlftsim.goals.types import Goals, PointById
+    from rlftsim.rollout.policy import Policy
+    from rlftsim.rollout.types import Rollouts
+    from rlftsim.scenario.any_form import AnyScenarios
+
+    Model: TypeAlias = Policy | str | os.PathLike[str]
+    Data: TypeAlias = AnyScenarios
+    File: TypeAlias = str | os.PathLike[str]
+    Name: TypeAlias = str | os.PathLike[str]
+    Metric: TypeAlias = str | int
+    ScoreMetric: TypeAlias = str | int
+    GoalPoints: TypeAlias = Goals | PointById | Mapping[str, PointById] | str | os.PathLike[str]
+    Simulated: TypeAlias = Rollouts | str | os.PathLike[str]
+    Result: TypeAlias = Evaluation | DriveResult | str | os.PathLike[str]
+else:
+    from pathlib import Path
+
+    Model = Data = Name = Metric = Annotated[Any, str]
+    File = GoalPoints = Simulated = Result = Annotated[Any, Path]
+    ScoreMetric = Annotated[Any, Literal["2025", "2024", "2024_original_code", "2023"]]
+
+Device = Literal["auto", "cpu", "cuda"]

@@ -1,0 +1,148 @@
+"""`rlftsim doctor`: checks of the machine, and forecasts of long work."""
+
+import inspect
+import os
+import platform
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+from rich.table import Table
+from rich.text import Text
+
+from rlftsim.errors import ConfigError
+from rlftsim.jobs.progress import print_wide
+from rlftsim.scenario.inspect import verify_dataset
+from rlftsim.scenario.synthetic import pack_path
+from rlftsim.verbs.plan import Plan, measure_cost, plan_table
+
+GOOD, WARNING, BAD = "good", "warning", "bad"
+MIN_FREE_GB = 2.0
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of one check."""
+
+    subject: str
+    state: str
+    finding: str
+
+
+def doctor(
+    plan: Plan | None = None,
+    model: str = "demo-base",
+    data: str = "synthetic",
+    measure: int = 5,
+    num_scenarios: int | None = None,
+    nodes: int = 1,
+    cores: int = 16,
+    price: float = 0.04,
+) -> int:
+    """Check this machine: versions, threads, GPU, disk, the embedded scenarios.
+
+    Prints what to do about each problem. With --plan: measure how long work on many machines would take, and what it
+    would cost. The exit status is 1 if a check failed.
+
+    Args:
+        plan: Forecast this work for the Waymo Open Motion Dataset instead, from its cost on this machine.
+        model: Run, model folder or registered name to measure, with --plan evaluate or submit.
+        data: Data set to measure on, with --plan; for convert, files to convert (all of them are).
+        measure: Number of scenarios to measure, of all sizes, with --plan evaluate or submit.
+        num_scenarios: Scenarios of the whole work, with --plan. Left out: 576000 to convert, 44100 to evaluate, 44920
+            to submit.
+        nodes: Number of machines that share the work, with --plan.
+        cores: Number of cores of each machine, with --plan.
+        price: Price of a core for an hour, in dollars, with --plan.
+    """
+    options = {name: value for name, value in locals().items() if name != "plan"}
+    if plan is not None:
+        cost = measure_cost(plan, model, data, measure)
+        print_wide(plan_table(plan, cost, num_scenarios=num_scenarios, nodes=nodes, cores=cores, price=price))
+        return 0
+    for name, value in options.items():
+        if value != inspect.signature(doctor).parameters[name].default:
+            flag = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{flag} has no effect: add --plan evaluate, convert or submit.")
+    diagnoses = [*_versions(), _threads(), _gpu(), _sumo(), _disk(), _pack()]
+    table = Table(show_header=False)
+    color = {GOOD: "green", WARNING: "yellow", BAD: "red"}
+    for diagnosis in diagnoses:
+        table.add_row(diagnosis.subject, Text(diagnosis.state, style=color[diagnosis.state]), diagnosis.finding)
+    print_wide(table)
+    return int(any(diagnosis.state == BAD for diagnosis in diagnoses))
+
+
+def _versions() -> Iterator[Diagnosis]:
+    """Python and torch, each with the oldest version that will do."""
+    for software, version_text, oldest in (
+        ("Python", platform.python_version(), (3, 11)),
+        ("torch", torch.__version__, (2, 10)),
+    ):
+        number = tuple(int(part) for part in version_text.split("+")[0].split(".")[:2])
+        if number >= oldest:
+            yield Diagnosis(software, GOOD, version_text)
+        else:
+            yield Diagnosis(software, BAD, f"{version_text}: needs {oldest[0]}.{oldest[1]} or newer")
+
+
+def _threads() -> Diagnosis:
+    """Compare two threads with one. Where two are slower, cores are shared and waiting threads spin."""
+    # torch keeps the number of threads for the process, so it is put back.
+    before = torch.get_num_threads()
+    seconds = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        seconds.append(_seconds_of_work())
+    torch.set_num_threads(before)
+    finding = f"{os.cpu_count()} cores, 2 threads take {seconds[1] / seconds[0]:.1f} times as long as 1"
+    if seconds[1] > 1.5 * seconds[0]:
+        policy = os.environ.get("OMP_WAIT_POLICY", "not set")
+        return Diagnosis(
+            "threads", WARNING, f"{finding}: OMP_WAIT_POLICY is {policy}, set it to PASSIVE or use 1 thread"
+        )
+    return Diagnosis("threads", GOOD, finding)
+
+
+def _seconds_of_work() -> float:
+    # The first product is not timed: it starts the threads.
+    x, w = torch.rand(4096, 64), torch.rand(64, 64)
+    torch.relu(x @ w)
+    start = time.perf_counter()
+    for _ in range(200):
+        torch.relu(x @ w).sum()
+    return time.perf_counter() - start
+
+
+def _gpu() -> Diagnosis:
+    if not torch.cuda.is_available():
+        return Diagnosis("GPU", WARNING, "none: the demo runs on the CPU, training on WOMD wants one")
+    return Diagnosis("GPU", GOOD, torch.cuda.get_device_name())
+
+
+def _sumo() -> Diagnosis:
+    try:
+        return Diagnosis("SUMO", GOOD, version("eclipse-sumo"))
+    except PackageNotFoundError:
+        hint = 'not installed: only `rlftsim synthesize` needs it (pip install "rlftsim[synthetic]")'
+        return Diagnosis("SUMO", WARNING, hint)
+
+
+def _disk() -> Diagnosis:
+    free = {str(folder): shutil.disk_usage(folder).free / 1e9 for folder in (Path.cwd(), Path(tempfile.gettempdir()))}
+    state = GOOD if min(free.values()) >= MIN_FREE_GB else WARNING
+    return Diagnosis(
+        "disk", state, ", ".join(f"{gigabytes:.1f} GB free in {folder}" for folder, gigabytes in free.items())
+    )
+
+
+def _pack() -> Diagnosis:
+    damaged = [finding for finding in verify_dataset(pack_path()) if finding.problem.is_damage]
+    if damaged:
+        return Diagnosis("synthetic scenarios", BAD, f"{damaged[0]}: install rlftsim again")
+    return Diagnosis("synthetic scenarios", GOOD, "whole")

@@ -1,0 +1,114 @@
+"""Data sets and policies by name, and the forms in which verbs take scenarios and policies."""
+
+import os
+from typing import Any
+
+import torch
+
+from rlftsim.errors import ConfigError, in_short
+from rlftsim.policies import registry
+from rlftsim.policies.registry import Device
+from rlftsim.rollout.policy import Policy, Sampling
+from rlftsim.scenario.any_form import Name, to_scenarios
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.open import open_dataset
+
+
+def load_dataset(name: Name, split: str | None = None) -> ScenarioDataset:
+    """Open a converted data set, or the one that ships with the package.
+
+    Args:
+        name: Folder of a data set that `rlftsim convert` or `write_dataset` wrote, or "synthetic".
+        split: Split to open, such as "training" or "validation"; None opens all splits.
+
+    Returns:
+        Scenarios by position; `by_id` finds one by its id.
+
+    Raises:
+        DataError: No data set there, or none of its scenarios is in the split; the message lists its splits.
+    """
+    return open_dataset(validate_name(name, "data set", "synthetic"), split)
+
+
+def load_policy(name: Name, device: Device = "auto") -> Policy:
+    """Load a policy that is ready to simulate: no dropout, no gradients.
+
+    Args:
+        name: Folder of a run or of a model, or name of a policy such as "constant_velocity".
+        device: Device of the weights: "cpu", "cuda", or "auto" for the GPU where torch sees one.
+
+    Raises:
+        ConfigError: Neither a registered name nor a folder, or no such device.
+        CheckpointError: A folder that is damaged or holds something else.
+    """
+    return registry.load_policy(validate_name(name, "policy", "constant_velocity"), device)
+
+
+def validate_name(name: Any, subject: str, example: str) -> Any:
+    """The name or path as it is.
+
+    Args:
+        name: Name of a data set, policy or recipe, as a user hands it over.
+        subject: Word for what has the name in the message, such as "data set".
+        example: Valid name, for the message.
+
+    Raises:
+        ConfigError: The name is neither text nor a path.
+    """
+    if not isinstance(name, str | os.PathLike):
+        raise ConfigError(f"{in_short(name)} is no name of a {subject}: give one, such as {example!r}.")
+    return name
+
+
+def to_policy(policy: Any, device: Device = "auto") -> Policy:
+    """The policy itself, or the policy of a name.
+
+    Args:
+        policy: Policy, or a name for `load_policy`.
+        device: Device of a policy that is loaded by its name.
+
+    Raises:
+        ConfigError: Neither a policy nor the name of one.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return load_policy(policy, device)
+    # A class has the methods of its policies, so it would pass for one.
+    if isinstance(policy, type):
+        raise ConfigError(
+            f"{policy.__name__} is a class, not a policy: make one, or load one with rs.load_policy(name)."
+        )
+    if not isinstance(policy, Policy):
+        raise ConfigError(f"{in_short(policy)} is not a policy: hand over one, or a name for rs.load_policy.")
+    return policy
+
+
+def to_batch(scenarios: Any, device: torch.device | str = "cpu") -> ScenarioBatch:
+    """Batch of scenarios; a batch stays as it is but for the device.
+
+    Args:
+        scenarios: Scenarios in any form that public functions take.
+        device: Device of the batch's tensors.
+
+    Raises:
+        ConfigError: No scenario, or something else was handed over.
+        DataError: No data set of this name, or an unsound scenario.
+    """
+    loaded = to_scenarios(scenarios)
+    if not isinstance(scenarios, ScenarioBatch):
+        scenarios = collate([loaded[position] for position in range(len(loaded))])
+    return scenarios.to(device)
+
+
+def to_sampling(sampling: Any) -> Sampling:
+    """Temperature and truncation; the whole distribution for None.
+
+    Args:
+        sampling: Settings, or None.
+
+    Raises:
+        ConfigError: Neither settings nor None.
+    """
+    if not isinstance(sampling, Sampling | None):
+        raise ConfigError(f"sampling must be rs.Sampling(temperature, top_k) or None, got {sampling!r}.")
+    return sampling or Sampling()

@@ -1,0 +1,125 @@
+"""`rlftsim model`: show and average models, import and export checkpoints of the public CAT-K code."""
+
+import sys
+from pathlib import Path
+from typing import Literal
+
+from torch import nn
+
+from rlftsim import __version__
+from rlftsim.errors import ConfigError
+from rlftsim.jobs.folder import check_file
+from rlftsim.policies.averaging import average_policies
+from rlftsim.policies.checkpoint import read_card
+from rlftsim.policies.registry import load_policy
+from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
+from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.recipes.card import append_cards
+
+Format = Literal["catk"]
+
+
+def import_model(checkpoint: Path, vocabulary: list[Path], out: Path, *, format: Format = "catk") -> None:
+    """Convert a checkpoint of the public CAT-K code to a model folder.
+
+    No code in the checkpoint is executed. It must have exactly the expected weights with the right shapes;
+    otherwise all differences are listed and nothing is written.
+
+    Args:
+        checkpoint: File: Lightning .ckpt, or .safetensors with the keys of its state dict.
+        vocabulary: Token tables of its training: npz with veh, ped, cyc and traj_src (may be two files), or a
+            vocabulary file.
+        out: Folder for the model.
+        format: Code that the checkpoint comes from.
+    """
+    _check_empty(out)
+    imported = import_catk(checkpoint, vocabulary)
+    imported.policy.save_pretrained(out, card=_card(checkpoint, imported))
+    weights = sum(p.numel() for p in imported.policy.parameters())
+    print(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
+    for note in imported.notes:
+        print(f"  {note}")
+
+
+def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
+    """Write a model's weights with the keys of the public CAT-K code, and its token tables.
+
+    Importing them again gives the same bits.
+
+    Args:
+        model: A SMART model: a run, a model folder or a registered name.
+        out: File for the weights, .safetensors; the tables go to the same name with .vocabulary.npz.
+        format: Code that the keys are for.
+    """
+    if out.suffix != ".safetensors":
+        raise ConfigError(f"{out}: weights are written as .safetensors: name the file so.")
+    policy = load_policy(model)
+    if not isinstance(policy, SmartPolicy):
+        raise ConfigError(
+            f"{model}: a {type(policy).__name__} cannot be exported, the public CAT-K code has SMART models alone."
+        )
+    tables = out.with_suffix(".vocabulary.npz")
+    check_file(out)
+    write_catk(policy, out)
+    write_catk_vocabulary(policy.vocabulary, tables)
+    print(f"{out}: weights\n{tables}: token tables")
+    if not policy.config.catk_compat:
+        print("  trained here: the public code treats an agent's first motion differently (docs/catk.md)")
+
+
+def average_models(models: list[str], out: Path, *, base: str | None = None, scale: float = 1.0) -> None:
+    """Write the mean of models that were fine-tuned from one base, as with other seeds.
+
+    It keeps what they share and has less of the noise of their gradients.
+
+    Args:
+        models: Models with the same settings and vocabulary: runs, model folders or registered names.
+        out: Folder for the model.
+        base: Model that they were fine-tuned from; for --scale alone.
+        scale: Factor on their distance from the base; above 1 goes further from the base than they did, along what
+            they share.
+    """
+    if base is not None and scale == 1.0:
+        raise ConfigError(f"--base {base} has no effect: the mean needs none, add --scale 2 to go further.")
+    _check_empty(out)
+    average = average_policies(
+        [load_policy(name) for name in models], base=None if base is None else load_policy(base), scale=scale
+    )
+    scaled = "" if base is None else f"* scale {scale:g} from {base}\n"
+    card = f"# Mean of {len(models)} models\n\n* {', '.join(models)}\n{scaled}"
+    card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
+    average.save_pretrained(out, card=append_cards(card, [*models, *filter(None, [base])]))
+    print(f"model: {out}")
+
+
+def show_model(model: str) -> None:
+    """Print what a model is: class, number of weights, card, and what the features of a calibrated one earn.
+
+    Args:
+        model: Run, model folder or registered name.
+    """
+    policy = load_policy(model)
+    weights = sum(p.numel() for p in policy.parameters()) if isinstance(policy, nn.Module) else 0
+    print(f"{model}: {type(policy).__name__}, {weights:,} weights\n")
+    print(read_card(model, heading_shift=0) or "No card.")
+
+
+def _check_empty(folder: Path) -> None:
+    """Check that a folder holds neither a model nor files that a model would replace."""
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"{folder} is not empty: name another folder for the model.")
+
+
+def _card(checkpoint: Path, imported: CatkImport) -> str:
+    notes = "\n".join(f"* {note}" for note in imported.notes)
+    return f"""# SMART traffic model ({imported.size}), imported
+
+* from {checkpoint.name}, a checkpoint of the public CAT-K code
+{notes}
+* computes what the public code computes (`catk_compat`)
+* terms: those of the checkpoint, of its token tables (CAT-K's own: NVIDIA, non-commercial research) and of the data
+  that it was trained on (Waymo Open Motion Dataset: non-commercial)
+* command: rlftsim {" ".join(sys.argv[1:])}
+* rlftsim {__version__}
+"""

@@ -1,0 +1,180 @@
+"""`rs.score` and `rlftsim score`: the official realism meta-metric of rollouts, in memory or in files."""
+
+import json as json_text
+import os
+import sys
+from pathlib import Path
+from typing import Literal, overload
+
+from rlftsim.errors import ConfigError
+from rlftsim.evaluation.explain_page import explain_rollouts
+from rlftsim.evaluation.results import Evaluation
+from rlftsim.evaluation.rollout_checks import warn_of_doubts
+from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
+from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import Unfinished, Work
+from rlftsim.realism import RealismResult, metric_by_name, score_batch
+from rlftsim.realism import score as score_scenario
+from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.types import Scenario
+from rlftsim.verbs.arguments import Data, File, ScoreMetric, Simulated
+from rlftsim.verbs.inputs import to_batch
+from rlftsim.viewer.notebook import check_rollouts
+
+
+@overload
+def score(scenarios: Data, rollouts: Rollouts, metric: ScoreMetric = "2025") -> RealismResult: ...
+@overload
+def score(
+    scenarios: Data, rollouts: File, metric: ScoreMetric = "2025", *, out: File | None = ..., name: str | None = ...,
+    explain: File | None = ..., missing_map: Literal["error", "skip"] = ...,
+    missing_scenario: Literal["error", "skip"] = ..., limit: int | None = ..., jobs: int | None = ..., work: Work = ...,
+) -> Evaluation: ...  # fmt: skip
+def score(
+    scenarios: Data,
+    rollouts: Simulated,
+    metric: ScoreMetric = "2025",
+    *,
+    out: File | None = None,
+    name: str | None = None,
+    explain: File | None = None,
+    missing_map: Literal["error", "skip"] = "error",
+    missing_scenario: Literal["error", "skip"] = "error",
+    limit: int | None = None,
+    jobs: int | None = None,
+    work: Work = Work(),  # noqa: B008
+) -> RealismResult | Evaluation:
+    """Score rollouts of any simulator with the official realism meta-metric.
+
+    Reads npz files (scenario_id, object_ids [A], x y z heading [N, A, 80]) and official submission files; see
+    docs/rollout_formats.md. In Python also those of `simulate`. With a folder for the results an interrupted run
+    continues when the same command is repeated.
+
+    Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
+
+    Args:
+        scenarios: The simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic".
+            In Python, for rollouts in memory, scenarios with their logged futures, in the same order.
+        rollouts: A file of rollouts, or a folder of them; in Python also a result of `simulate`.
+        metric: Year of the meta-metric. 2024 is the configuration of that year read by today's code, 2024_original_code
+            the code of that year too.
+        out: Folder for the per-scenario results (Parquet).
+        name: Name of the table row and of the file. Left out: the name of the rollouts.
+        explain: Folder for one page per scenario that attributes the lost score to features, agents and steps.
+        missing_map: A scenario without road edges stops the run, as in the official evaluator, or is left out and
+            listed.
+        missing_scenario: Rollouts of a scenario that is not among the given ones stop the run, or are left out and
+            listed.
+        limit: Only the first so many scenarios.
+        jobs: Processes, each with one thread; left out, as many as there are cores. Changes no result.
+        work: Machines that share the work on files.
+
+    Returns:
+        Scores of rollouts in memory, without a leading axis for a `Scenario`, else with one of B scenarios. Of files an
+        evaluation with a row per scenario.
+
+    Raises:
+        ConfigError: Rollouts of other scenarios, no such metric, or an option of files for rollouts in memory.
+        DataError: A scenario that cannot be scored, such as one without its future, a pose that is not finite, a
+            scenario with other agents than the simulated one, or a file that cannot be read.
+    """
+    if isinstance(rollouts, str | os.PathLike) and not isinstance(scenarios, Rollouts):
+        return _score_files(
+            Path(rollouts), scenarios, out, name, explain,
+            ScoreConfig(str(metric), missing_map, missing_scenario, limit, jobs),  # pyright: ignore[reportArgumentType]
+            work,
+        )  # fmt: skip
+    for option, value in {"out": out, "name": name, "explain": explain, "limit": limit, "jobs": jobs}.items():
+        if value is not None:
+            raise ConfigError(f"{option} has no effect on rollouts in memory: leave it out, or name files of rollouts.")
+    check_rollouts("score", scenarios, rollouts)
+    assert isinstance(rollouts, Rollouts)
+    batch = _matching_batch(scenarios, rollouts)
+    # in the world frame and without padding
+    states, config = states_of_rollouts(batch, rollouts), metric_by_name(str(metric))
+    for scenario, simulated in zip(batch.scenarios, states):
+        simulated.check_finite(scenario.scenario_id)
+        warn_of_doubts(scenario, simulated)
+    if isinstance(scenarios, Scenario):
+        return score_scenario(scenarios, states[0], config)
+    return score_batch(batch.scenarios, states, config)
+
+
+def _score_files(
+    rollouts: Path,
+    scenarios: Data,
+    out: File | None,
+    name: str | None,
+    explain: File | None,
+    config: ScoreConfig,
+    work: Work,
+) -> Evaluation:
+    """Scores of rollouts in files, and pages that explain them; arguments as in `score`."""
+    if isinstance(scenarios, ScenarioDataset):
+        scenarios = scenarios.folder
+    if not isinstance(scenarios, str | os.PathLike):
+        raise ConfigError(f"rollouts in files need the name of a data set, got {type(scenarios).__name__}.")
+    folder, runner = dataset_folder(scenarios), work.runner(config.num_jobs, work.on_error)
+
+    def write_pages() -> None:
+        if explain is not None:
+            pages = explain_rollouts(rollouts, folder, explain, config, runner=runner)
+            print(f"{explain}: {len(pages)} pages", file=sys.stderr)
+
+    # Before the pages: what scores refuse, such as a name or a share, is refused before a page is written.
+    try:
+        result = score_rollouts(rollouts, folder, out, config, name=name, runner=runner)
+    except Unfinished:
+        write_pages()
+        raise
+    write_pages()
+    return result
+
+
+def _matching_batch(scenarios: Data, rollouts: Rollouts) -> ScenarioBatch:
+    """The scenarios that rollouts are of, as a batch in the frame of the rollouts.
+
+    Raises:
+        ConfigError: They are of other scenarios: by the ids of scenarios and agents where the rollouts know them, else
+            by numbers.
+    """
+    batch = to_batch(scenarios, rollouts.position.device)
+    about = rollouts.provenance
+    if about is not None:
+        ids = tuple(scenario.scenario_id for scenario in batch.scenarios)
+        if about.scenario_ids != ids:
+            simulated = ", ".join(about.scenario_ids[:3])
+            raise ConfigError(
+                f"rollouts of {simulated} do not belong to {', '.join(ids[:3])}: hand over the same scenarios."
+            )
+        for row, scenario in enumerate(batch.scenarios):
+            about.check_same_agents(row, scenario)
+        if batch.frame != about.frame:
+            batch = collate(batch.scenarios, frame=about.frame).to(batch.device)
+    num_scenarios, _, num_agents = rollouts.position.shape[:3]
+    if num_scenarios != batch.num_scenarios or num_agents < batch.agent_mask.shape[1]:
+        raise ConfigError(
+            f"rollouts of {num_scenarios} scenarios with up to {num_agents} agents do not belong to "
+            f"{batch.num_scenarios} with up to {batch.agent_mask.shape[1]}: hand over the same scenarios."
+        )
+    return batch
+
+
+def print_scores(result: Evaluation, *, json: bool = False) -> None:
+    """Print every mean.
+
+    Args:
+        result: Scores of rollouts in files.
+        json: Print JSON with the field names of the official messages instead of a table.
+    """
+    if json:
+        print(json_text.dumps(to_json(result), allow_nan=False))
+    else:
+        print_wide(format_scores(result))
+    # On standard error, so that --json prints nothing but JSON.
+    for skipped in result.skipped:
+        print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)

@@ -1,0 +1,218 @@
+"""`rlftsim submit`: build, check or describe an archive for the Sim Agents challenge."""
+
+import time
+from pathlib import Path
+
+from rlftsim.errors import ConfigError, DataError, shorten
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
+from rlftsim.evaluation.scenario_source import choose_scenarios
+from rlftsim.evaluation.score_files import format_scores
+from rlftsim.jobs.folder import check_file
+from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import Work
+from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.simulate import check_sampling
+from rlftsim.scenario.open import open_dataset
+from rlftsim.submission.build import Job, build_archive, delete_shards
+from rlftsim.submission.check import ArchiveCheck, check_archive
+from rlftsim.submission.closed_loop import check_closed_loop, statement
+from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
+from rlftsim.submission.plan import check_complete, check_sources, make_plan
+from rlftsim.submission.report import (
+    Report,
+    estimate_realism,
+    model_card,
+    reported_sha256,
+    select_findings,
+    write_findings,
+)
+from rlftsim.submission.scores import ArchiveScores
+from rlftsim.submission.transfer import split_file
+from rlftsim.verbs.arguments import Device
+
+CACHED_SCENARIOS = 2
+"""Each is read once."""
+EVALUATIONS = Path("runs/evaluations")
+
+
+def build(
+    model: str,
+    data: str,
+    out: Path,
+    config: Path,
+    *,
+    split: str = "testing",
+    account: str | None = None,
+    method: str | None = None,
+    i_comply: bool = False,
+    num_shards: int = 150,
+    seed: int = 0,
+    temperature: float = 1.0,
+    top_k: int | None = None,
+    rollouts_per_pass: int = 8,
+    jobs: int = 1,
+    device: Device = "auto",
+    round: float | None = None,
+    delete_parts: bool = False,
+    partial: bool = False,
+    evaluation: Path | None = None,
+    work: Work = Work(),  # noqa: B008
+) -> int:
+    """Simulate a split and pack it as a .tar.gz for the upload page, checked. Nothing is uploaded.
+
+    An interrupted build continues when the same command is repeated. The archive's bytes depend on model, data and
+    settings alone. The exit status is 1 if the server would refuse the archive.
+
+    Args:
+        model: A run, a model folder, or a registered name.
+        data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
+        out: Folder of the archive.
+        config: TOML file with account, method, authors, affiliation, description and link (docs/submission.md).
+        split: Split of the data set.
+        account: E-mail address of the account that uploads, in place of the file's.
+        method: Name on the leaderboard, in place of the file's.
+        i_comply: Declare that the entry complies with the closed-loop requirement. Without it, the statement is
+            printed.
+        num_shards: Number of files in the archive; one is repeated by an interruption of each process.
+        seed: Seed of the rollouts.
+        temperature: Sampling temperature; 0 always takes the most likely motion.
+        top_k: Number of candidates: sample among the TOP_K most likely motions only.
+        rollouts_per_pass: Rollouts simulated together. Changes no result.
+        jobs: Processes, each with one thread. Changes no byte.
+        device: Device of the model; several processes (--jobs) need cpu.
+        round: Grid of positions: rounded to a power of two of at most so many meters. 0.001 makes the archive about a
+            seventh smaller and changed the meta-metric of 13 real scenarios by at most 0.00005.
+        delete_parts: Delete each compressed shard once it is in the archive: half the disk space, and damage
+            found later means simulating again.
+        partial: Build although files of the split are missing, to try things out. The server refuses such an
+            archive.
+        evaluation: Evaluation of the same model on the validation split, for the estimate in the report. Left
+            out: runs/evaluations/MODEL.parquet.
+        work: Machines that share the work.
+    """
+    start = time.monotonic()
+    # 1. everything that can be refused is refused before anything is simulated
+    entry = read_entry(config, account=account, method=method)
+    policy = frozen_copy(load_policy(model, device))
+    dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
+    settings = EvaluateConfig(
+        seed=seed, temperature=temperature, top_k=top_k,
+        split=split, rollouts_per_pass=rollouts_per_pass, jobs=jobs,
+    )  # fmt: skip
+    check_sources(dataset)
+    if not partial:
+        check_complete(dataset)
+    check_closed_loop(policy, dataset[0])
+    check_sampling(policy, dataset, settings.sampling)
+    closed_loop = statement(policy, settings.sampling)
+    print(closed_loop)
+    if not i_comply:
+        raise ConfigError("an entry has to declare this: add --i-comply if it is true of yours.")
+    # 2. build
+    parameters = count_parameters(policy)
+    metadata = describe_entry(entry, parameters)
+    fingerprint = fingerprint_policy(policy)
+    plan = make_plan(dataset, fingerprint, metadata, settings, num_shards=num_shards, round_m=round)
+    job = Job(policy, dataset, plan, metadata, settings, round, out)
+    archive = build_archive(job, runner=work.runner(jobs, work.on_error), is_deleting=delete_parts)
+    # 3. check the file that will be uploaded, and report
+    result = check_archive(archive, dataset)
+    evaluation = evaluation or EVALUATIONS / f"{evaluation_name(model)}.parquet"
+    findings, counts = select_findings(result)
+    origin = {"model": model, "data set": str(dataset.folder), **plan.identity}
+    report = Report(
+        archive.name, result.size, result.sha256, entry.method, parameters, len(result.shards), result.num_scenarios,
+        result.num_trajectories, result.raw_bytes, findings, counts, closed_loop, model_card(model),
+        origin, time.monotonic() - start,
+        estimate_realism(evaluation, fingerprint, settings),
+    )  # fmt: skip
+    text, _ = report.write(archive)
+    _print_findings(result)
+    if result.findings.has_errors:
+        print(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
+    else:
+        delete_shards(job)
+    print(f"{archive}: {result.size} bytes, SHA-256 {result.sha256}\n{text}")
+    return int(result.findings.has_errors)
+
+
+def check(
+    archive: Path,
+    data: str,
+    *,
+    split: str = "testing",
+    sample: float = 1.0,
+    json: Path | None = None,
+    score: bool = False,
+) -> int:
+    """Check an archive of any writer against the data set: everything that is known to make the server refuse one.
+
+    The exit status is 1 if there is an error.
+
+    Args:
+        archive: The .tar.gz to check, of this or another writer.
+        data: Folder of a data set, or "synthetic".
+        split: Split that the archive is for.
+        sample: Fraction of the scenarios whose trajectories are looked at, for a quick look.
+        json: File for the findings as JSON.
+        score: Score the rollouts, too; for an archive of the validation split.
+
+    Raises:
+        DataError: `score`, and the scenarios have no logged future, or the archive no scenario that can be scored.
+    """
+    if json is not None:
+        check_file(json)
+    dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
+    if score:
+        try:
+            choose_scenarios(dataset, EvaluateConfig(split=split))
+        except DataError as error:
+            raise DataError(f"--score is for the validation split: {error}") from None
+    scores = ArchiveScores() if score else None
+    result = check_archive(archive, dataset, sample=sample, expected_sha256=reported_sha256(archive), callback=scores)
+    _print_findings(result)
+    if json is not None:
+        write_findings(result, json)
+    if scores is not None:
+        evaluation = scores.evaluation(result.archive, dataset, result.sha256)
+        if not len(evaluation):
+            reason = evaluation.skipped[0].reason if evaluation.skipped else "none that was read is without an error"
+            raise DataError(
+                f"--score: none of {len(dataset)} scenarios of split {split} of {data} could be scored "
+                f"({reason}): see the findings above{', or give a larger --sample' if sample < 1 else ''}."
+            )
+        print_wide(format_scores(evaluation))
+    return int(result.findings.has_errors)
+
+
+def info(archive: Path, *, split_gb: float | None = None) -> int:
+    """Print what is in an archive, without a data set.
+
+    Args:
+        archive: The .tar.gz to describe, of this or another writer.
+        split_gb: Size in GB of parts that the archive is also cut into, for moving it about. The upload page takes the
+            joined file.
+    """
+    result = check_archive(archive, None)
+    _print_findings(result)
+    if result.metadata is not None:
+        for entry, value in result.metadata.ListFields():
+            text = ", ".join(map(str, value)) if entry.is_repeated else str(value)
+            print(f"  {entry.name}: {shorten(text)}")
+    if split_gb is not None:
+        files = split_file(archive, split_gb)
+        print(f"{len(files)} parts; join them with: cat {archive.name}.??? > {archive.name}")
+    return int(result.findings.has_errors)
+
+
+def _print_findings(check: ArchiveCheck) -> None:
+    """Print each finding, and what was checked."""
+    for line in check.findings.lines():
+        print(line)
+    note = "" if check.num_checked == check.num_scenarios else f", trajectories of {check.num_checked} looked at"
+    print(
+        f"{check.archive}: {len(check.shards)} shards, {check.num_scenarios} scenarios{note}, "
+        f"{check.raw_bytes / 1e9:.3g} GB of messages, {check.size} bytes, SHA-256 {check.sha256}: "
+        f"{sum(check.findings.counts.values()) or 'no'} findings."
+    )

@@ -1,0 +1,36 @@
+"""`rlftsim synthesize`: synthetic scenarios made with SUMO."""
+
+from pathlib import Path
+
+from rlftsim.jobs.runner import Work
+from rlftsim.scenario.synthetic.generate import generate
+
+
+def synthesize(
+    destination: Path,
+    *,
+    num_scenarios: int = 200,
+    seed: int = 0,
+    jobs: int = 1,
+    work: Work = Work(),  # noqa: B008
+) -> None:
+    """Make synthetic scenarios with SUMO (pip install "rlftsim[synthetic]").
+
+    The same arguments and SUMO version give the same scenarios. The pack that ships with the package was made
+    this way; its manifest holds the arguments.
+
+    Args:
+        destination: Folder of the data set.
+        num_scenarios: Scenarios in training and validation together, 4 : 1. No street network is in both.
+        seed: Seed of streets and traffic.
+        jobs: Processes, each with a street network of its own. Changes no result.
+        work: Machines that share the work.
+    """
+    manifest = generate(
+        destination,
+        num_scenarios=num_scenarios,
+        seed=seed,
+        jobs=jobs,
+        runner=work.runner(jobs, work.on_error),
+    )
+    print(f"{destination}: {sum(shard.num_rows for shard in manifest.shards)} scenarios.")
