@@ -29,8 +29,8 @@ def convert(
     An interrupted conversion continues when the same command is repeated. The sources are not needed afterwards.
 
     Args:
-        source: For WOMD a tfrecord shard, a folder of shards, or a quoted glob such as 'training/*tfrecord*'.
-            For other sources a folder.
+        source: WOMD tfrecord shard, folder of shards, or quoted glob such as 'training/*tfrecord*'; of other sources
+            a folder.
         destination: Folder of the data set.
         reader: Format of the source: womd, av2 (Argoverse 2 motion forecasting), tables (Parquet tables of your
             own recordings), or the name of a data source of another package (docs/extending.md). auto:
@@ -41,8 +41,7 @@ def convert(
         window: Steps of av2 only: the 91 of 110 steps that are taken, last (the default), first, or both as two
             scenarios. av2: 71 steps around the data set's own current step, which cannot be scored.
         keep_other: Keep, of av2 only, static objects, construction and the like as objects of no particular type.
-        sizes: For av2 only: JSON file with length, width and height in meters by kind, in place of the guessed
-            ones.
+        sizes: JSON file with length, width and height in meters by kind, in place of the guessed ones; av2 only.
         machines: Machines that share the work.
     """
     options = {"window": window, "keep_other": keep_other or None, "sizes": sizes}

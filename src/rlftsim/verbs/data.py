@@ -87,8 +87,8 @@ def _stats_rows(stats: DatasetStats) -> dict[str, str]:
         "size": f"{stats.kilobytes_per_scenario:.1f} kB a scenario",
     }
     return rows | {
-        f"speed of {kind}s": f"mean {s.mean_mps:.1f}, 95 % below {s.p95_mps:.1f}, at most {s.max_mps:.1f} m/s"
-        for kind, s in stats.speeds.items()
+        f"speed of {agent_type}s": f"mean {s.mean_mps:.1f}, 95 % below {s.p95_mps:.1f}, at most {s.max_mps:.1f} m/s"
+        for agent_type, s in stats.speeds.items()
     }
 
 

@@ -37,7 +37,7 @@ def drive(
         split: Split of the data set.
         traffic: Drivers of the other agents, separated by commas: policy, replay, constant_velocity, idm.
         scenario: Ids of the scenarios to drive; left out, all of the split.
-        limit: Only the first LIMIT scenarios.
+        limit: Number of scenarios, the first ones of the data set; left out, all of them.
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.
         seed: Seed of the traffic. The same seed gives every planner the same dice.
         jobs: Processes, each with one thread. Changes no result.

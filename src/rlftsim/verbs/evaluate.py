@@ -47,7 +47,7 @@ def evaluate(
     is repeated.
 
     Args:
-        policy: A run, a model folder, a registered name such as "constant_velocity", or "oracle" (the log itself: the
+        policy: Run, model folder, registered name such as "constant_velocity", or "oracle" (the log itself: the
             ceiling). In Python also a policy.
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package. In Python also an
             opened data set or scenarios in any other form.
@@ -56,7 +56,7 @@ def evaluate(
         out: Folder for the results. In Python they may be in memory alone.
         num_rollouts: Rollouts per scenario; the official metric is defined for 32.
         seed: Seed of all randomness. The same seed gives the same scores.
-        limit: Only the first so many scenarios.
+        limit: Number of scenarios, the first ones of the data set; left out, all of them.
         metric: Year of the meta-metric.
         sampling: Temperature and truncation of the decisions; left out, the whole distribution is sampled.
         goals: Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model.

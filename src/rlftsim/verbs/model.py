@@ -49,7 +49,7 @@ def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
     Importing them again gives the same bits.
 
     Args:
-        model: A SMART model: a run, a model folder or a registered name.
+        model: SMART model: run, model folder or registered name.
         out: File for the weights, .safetensors; the tables go to the same name with .vocabulary.npz.
         format: Code that the keys are for.
     """

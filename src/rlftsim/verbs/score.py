@@ -57,19 +57,19 @@ def score(
     Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
 
     Args:
-        scenarios: The simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic".
+        scenarios: Simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic".
             In Python, for rollouts in memory, scenarios with their logged futures, in the same order.
-        rollouts: A file of rollouts, or a folder of them; in Python also a result of `simulate`.
+        rollouts: File of rollouts, or folder of them; in Python also a result of `simulate`.
         metric: Year of the meta-metric. 2024 is the configuration of that year read by today's code, 2024_original_code
             the code of that year too.
         out: Folder for the per-scenario results (Parquet).
         name: Name of the table row and of the file. Left out: the name of the rollouts.
         explain: Folder for one page per scenario that attributes the lost score to features, agents and steps.
-        missing_map: A scenario without road edges stops the run, as in the official evaluator, or is left out and
-            listed.
-        missing_scenario: Rollouts of a scenario that is not among the given ones stop the run, or are left out and
-            listed.
-        limit: Only the first so many scenarios.
+        missing_map: Treatment of a scenario without road edges: it stops the run, as in the official evaluator, or is
+            left out and listed.
+        missing_scenario: Treatment of rollouts of a scenario that is not among the given ones: they stop the run, or
+            are left out and listed.
+        limit: Number of scenarios, the first ones; left out, all of them.
         jobs: Processes, each with one thread; left out, as many as there are cores. Changes no result.
         work: Machines that share the work on files.
 

@@ -65,7 +65,7 @@ def build(
     settings alone. The exit status is 1 if the server would refuse the archive.
 
     Args:
-        model: A run, a model folder, or a registered name.
+        model: Run, model folder, or registered name.
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
         out: Folder of the archive.
         config: TOML file with account, method, authors, affiliation, description and link (docs/submission.md).
@@ -151,7 +151,7 @@ def check(
     The exit status is 1 if there is an error.
 
     Args:
-        archive: The .tar.gz to check, of this or another writer.
+        archive: Archive (.tar.gz) to check, of this or another writer.
         data: Folder of a data set, or "synthetic".
         split: Split that the archive is for.
         sample: Fraction of the scenarios whose trajectories are looked at, for a quick look.
@@ -190,7 +190,7 @@ def info(archive: Path, *, split_gb: float | None = None) -> int:
     """Print what is in an archive, without a data set.
 
     Args:
-        archive: The .tar.gz to describe, of this or another writer.
+        archive: Archive (.tar.gz) to describe, of this or another writer.
         split_gb: Size in GB of parts that the archive is also cut into, for moving it about. The upload page takes the
             joined file.
     """
