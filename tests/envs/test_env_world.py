@@ -330,6 +330,14 @@ def test_idm_traffic_backs_up_as_in_its_log(speed):
     np.testing.assert_allclose(now[3:], logged[3:], atol=0.3)
 
 
+def test_traffic_of_smart_that_backs_up_starts_without_a_jump(model):
+    log = build_scenario("backing", (Mover(x_m=60.0, y_m=30.0), Mover(x_m=10.0, speed_mps=-5.0)))
+    world = build_world([log], model)
+    state = begin(world, [Dice(0)])
+    moved = step_world(world, state, world.logged[0, :1, CURRENT_STEP]).motion[0, 1, :2] - state.motion[0, 1, :2]
+    assert np.linalg.norm(moved) < 1.0
+
+
 def test_lights_hold_their_last_state_where_a_log_ends():
     cut = replace(without_future(), lights=junction_with_light().lights)
     lights = cut.lights
