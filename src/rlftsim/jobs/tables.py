@@ -237,7 +237,8 @@ def _count_text_bytes(array: pa.Array) -> int:
     if isinstance(array, pa.DictionaryArray):
         if pa.types.is_primitive(array.type.value_type):
             return 0
-        return pc.sum(pc.binary_length(array.dictionary).take(array.indices)).as_py() or 0
+        lengths = pc.call_function("binary_length", [array.dictionary]).take(array.indices)
+        return pc.call_function("sum", [lengths]).as_py() or 0
     if pa.types.is_nested(array.type):
         inner = array.flatten()
         return sum(map(_count_text_bytes, inner if isinstance(inner, list) else [inner]))
