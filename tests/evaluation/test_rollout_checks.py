@@ -99,8 +99,7 @@ def test_what_no_road_user_does_is_told(warnings_of, axis, change, text):
 def test_headings_of_a_minority_of_rollouts_are_no_doubt_about_the_scenario(warnings_of, change):
     states = logged_states(SCENARIO, num_rollouts=8)
     for count, is_told in ((3, False), (5, True)):
-        heading = states.heading.clone()
-        heading[:count] += change
+        heading = states.heading + (torch.arange(8) < count)[:, None, None] * change
         assert bool(warnings_of(replace(states, heading=heading))) == is_told
 
 

@@ -194,7 +194,7 @@ def _sample_path(path: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, "P 2
     turns = turns[np.append(True, np.diff(is_backward[turns]))]
     bounds = [0, *turns[1:].tolist()]
     lines = [
-        resample_to(path[start : end + 1, :2], round(length[end] - length[start]) + 1)[:-1]
+        resample_to(path[start : end + 1, :2], round(float(length[end] - length[start])) + 1)[:-1]
         for start, end in pairwise(bounds)
     ]
     lines.append(sample_line(path[bounds[-1] :, :2], 1.0))

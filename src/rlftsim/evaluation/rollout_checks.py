@@ -25,7 +25,8 @@ MAX_STEP_M, DOUBTFUL_STEP_M = 8.0, 5.0
 """In 0.1 s."""
 MAX_HEADING_RAD = 100.0
 MAX_FIRST_TURN_RAD = math.radians(MAX_ASKEW_DEG)
-"""Between the current heading and that of the first step, of half of the agents: headings of logs jump, too."""
+"""Between the current heading and that of the first step, of half of the agents: headings of 36 of 11 371 real agents
+jump by more, of at most 22 % in a scenario."""
 MAX_HEIGHT_CHANGE_M = 20.0
 MAX_FIRST_STEP_ERROR_M = 3.0
 """Between the first simulated position and that of constant velocity, or the current one if it is nearer."""

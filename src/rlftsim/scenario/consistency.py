@@ -24,7 +24,8 @@ DRIVING_MPS = 3.0
 """Vehicles and cyclists that are faster face the way they move; slower ones may back up, and pedestrians step aside."""
 MAX_ASKEW_DEG = 20.0
 """Between heading and motion, median over a track. Of 4 589 real tracks faster than 2 m/s 3 are beyond, of 2 374
-synthetic ones none; the median track of each of their scenarios is at most 8.1 degrees off."""
+synthetic ones none; the median track of each of their scenarios is at most 8.1 degrees off. Of 515 paths that
+`demo-base` simulates the worst is 6.3 off."""
 MIN_COSINE = math.cos(math.radians(MAX_ASKEW_DEG))
 MAX_CLIMB_M = 2.0
 """In 0.1 s; no track of 573 real and synthetic scenarios climbs or falls by more than 0.8."""

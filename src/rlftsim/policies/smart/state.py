@@ -21,7 +21,7 @@ class SmartContext:
 
     scene: Scene
     history: TokenSteps
-    """The two history tokens of a single rollout. The last ends at the current step, near the logged position."""
+    """The two history tokens of a single rollout. The last ends at the current step, near the logged pose or at it."""
     view: View
     """Of the history."""
     past: Past
