@@ -20,7 +20,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import open_dataset
-from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 from scenes import Mover, bend, build_scenario, junction_with_light, straight_road, with_gaps, without_future
 
 
@@ -328,6 +328,42 @@ def test_idm_traffic_backs_up_as_in_its_log(speed):
     assert now[2] == pytest.approx(0.5, abs=1e-3)
     np.testing.assert_allclose(now[:2], logged[:2], atol=0.2)
     np.testing.assert_allclose(now[3:], logged[3:], atol=0.3)
+
+
+def shuttling(acceleration_mps2, speed_mps=-3.0, heading_rad=0.5):
+    """A log of a vehicle that backs up, stops, and goes on forward (or the other way around)."""
+    log = build_scenario("turning", (Mover(x_m=60.0, y_m=30.0), Mover(x_m=10.0, heading_rad=heading_rad)))
+    time = STEP_S * (np.arange(91) - CURRENT_STEP)
+    speed = speed_mps + acceleration_mps2 * np.maximum(time, 0.0)
+    forward = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+    tracks, row = log.tracks, log.simulated_indices[1]
+    position, velocity = tracks.position.copy(), tracks.velocity.copy()
+    way = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * STEP_S))
+    position[row, :, :2] += ((way - way[CURRENT_STEP]) - 8.0 * time)[:, None] * forward
+    velocity[row] = speed[:, None] * forward
+    return replace(log, tracks=replace(tracks, position=position, velocity=velocity))
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration"), [(-3.0, 0.6), (-3.0, 1.5), (-3.0, 2.5), (3.0, 0.6), (3.0, 2.5), (-1.2, 0.6), (-1.2, 1.5)]
+)
+def test_idm_traffic_stops_before_it_goes_the_other_way(speed, acceleration):
+    log = shuttling(-np.sign(speed) * acceleration, speed)
+    world = build_world([log], None, rules={"ego": "planner", "vehicles": "idm", "*": "replay"})
+    state = begin(world, [Dice(0)])
+    motion = [state.motion[0, 1]]
+    for _ in range(80):
+        state = step_world(world, state, world.logged[0, :1, CURRENT_STEP])
+        motion.append(state.motion[0, 1])
+    motion = np.array(motion)
+    forward = motion[:, 3] * np.cos(0.5) + motion[:, 4] * np.sin(0.5)
+    assert np.sign(forward[-1]) == -np.sign(speed)
+    assert np.abs(np.diff(forward)).max() <= 3.02 * STEP_S
+    np.testing.assert_allclose(motion[:, 2], 0.5, atol=1e-3)
+    moved = np.linalg.norm(np.diff(motion[:, :2], axis=0), axis=1) / STEP_S
+    np.testing.assert_allclose(moved, np.abs(forward[1:] + forward[:-1]) / 2, atol=0.35, rtol=0.4)
+    way = np.append(0.0, np.cumsum(moved * np.sign(forward[1:]) * np.sign(speed))) * STEP_S
+    assert way.max() == pytest.approx(speed**2 / 2 / acceleration, abs=0.3)  # it turns where its log does
 
 
 def test_traffic_of_smart_that_backs_up_starts_without_a_jump(model):

@@ -38,7 +38,7 @@ def test_the_first_contradictory_track_is_named_with_its_speeds(tracks):
 
 
 def test_headings_in_degrees_or_from_north_contradict_the_motion(tracks):
-    for heading in (np.rad2deg(tracks.heading + np.pi / 2), np.pi / 2 - tracks.heading):
+    for heading in (np.rad2deg(tracks.heading + np.pi / 2), np.pi / 2 - tracks.heading, tracks.heading + 0.5):
         assert describe_contradictions(replace(tracks, heading=heading.astype(np.float32))).startswith("headings ")
 
 
