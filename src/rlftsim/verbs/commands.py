@@ -237,6 +237,7 @@ COMMANDS = {
         "rlftsim.verbs.finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
         "print_model", FINETUNING,
     ),
+    "runs": Command("rlftsim.verbs.runs:runs", ("folders",), show="print_runs"),
     "augment": Command("rlftsim.verbs.augment:augment", ("model",)),
     "model show": Command("rlftsim.verbs.model:show_model", ("model",)),
     "model average": Command("rlftsim.verbs.model:average_models", ("models",)),
