@@ -239,6 +239,7 @@ COMMANDS = {
     ),
     "runs": Command("rlftsim.verbs.runs:runs", ("folders",), show="print_runs"),
     "augment": Command("rlftsim.verbs.augment:augment", ("model",)),
+    "models": Command("rlftsim.verbs.model:list_models"),
     "model show": Command("rlftsim.verbs.model:show_model", ("model",)),
     "model average": Command("rlftsim.verbs.model:average_models", ("models",)),
     "model import": Command("rlftsim.verbs.model:import_model", ("checkpoint",), names={"format": "from"}),
