@@ -1,6 +1,7 @@
 """Results of `rlftsim drive`: a Parquet file with a row per scenario, for a planner in a type of traffic."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
@@ -27,6 +28,18 @@ MAIN_SCORES = (
     "at_fault_collision_rate", "hit_rate", "others_realism", "others_collision_rate", "others_offroad_rate",
 )  # fmt: skip
 """Columns of the table and of comparisons on the command line; the file has more."""
+CAUSES = {
+    "no_at_fault_collision": "at fault for a collision", "drivable_area": "leaves the road",
+    "driving_direction": "drives against its lane", "making_progress": "hardly moves",
+    "time_to_collision": "gets too close", "progress": "is slow", "speed_limit": "is too fast",
+    "comfort": "jerks",
+}  # fmt: skip
+"""Part of the score `nuplan_style` -> what a planner does where it is low, the heaviest first."""
+FAILURES = (CAUSES["no_at_fault_collision"], CAUSES["drivable_area"])
+LOW = 0.5
+"""A part of the score below this is named as a cause."""
+FAILED = "all scores"
+"""Name under which `DriveResult.missing` has the error of a planner that failed."""
 TEXTS = ("scenario_id", "traffic")
 """Columns that are no scores."""
 
@@ -86,6 +99,11 @@ class DriveResult:
     def name(self) -> str:
         """Planner and traffic."""
         return f"{self.settings.planner} in {self.settings.traffic}"
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Scenario id -> error of the planner that failed there; all its scores are NaN."""
+        return {name: reasons[FAILED] for name, reasons in self.missing.items() if FAILED in reasons}
 
     @property
     def scenario_ids(self) -> list[str]:
@@ -217,6 +235,46 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
     rows = (compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
     return DriveComparison(a, b, tuple(rows))
+
+
+@dataclass(frozen=True)
+class RankedScenario:
+    """A scenario with the lowest score of a planner in some types of traffic."""
+
+    scenario_id: str
+    score: float
+    """Lowest `nuplan_style`."""
+    traffic: str
+    """Type of traffic with this score."""
+    causes: tuple[str, ...]
+    """What the planner does there, of `CAUSES`."""
+
+
+def rank_scenarios(results: Sequence[DriveResult]) -> list[RankedScenario]:
+    """Scenarios by the lowest score of the planner in any traffic, the worst first; without those that have no score.
+
+    Args:
+        results: Results of a planner in types of traffic, on the same scenarios.
+    """
+    rows = [
+        (float(result.values("nuplan_style")[row]), scenario_id, result, row)
+        for result in results
+        for row, scenario_id in enumerate(result.scenario_ids)
+    ]
+    worst: dict[str, RankedScenario] = {}
+    for score, scenario_id, result, row in sorted(rows, key=lambda entry: entry[0]):
+        if scenario_id not in worst and not math.isnan(score):
+            causes = tuple(cause for name, cause in CAUSES.items() if result.values(name)[row] < LOW)
+            worst[scenario_id] = RankedScenario(scenario_id, score, result.settings.traffic, causes)
+    return list(worst.values())
+
+
+def format_worst(scenarios: Sequence[RankedScenario]) -> Table:
+    """A row per scenario: score, traffic and what the planner does there."""
+    table = Table("worst scenarios", "nuplan_style", "traffic", "the planner")
+    for scenario in scenarios:
+        table.add_row(scenario.scenario_id, f"{scenario.score:.4f}", scenario.traffic, ", ".join(scenario.causes))
+    return table
 
 
 def format_drives(*results: DriveResult) -> Table:
