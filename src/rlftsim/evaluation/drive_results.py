@@ -15,7 +15,7 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
-from rlftsim.evaluation.compare import PairedDifference, compare_paired
+from rlftsim.evaluation.compare import PairedDifference, compare_paired, comparison_table
 from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import write_atomically
@@ -290,22 +290,22 @@ def format_drives(*results: DriveResult) -> Table:
             + (f" ± {format_number(mean.standard_error, 4)}" if mean.count > 1 else "")
             for mean in means
         ]  # fmt: skip
-        table.add_row(f"{name} {ARROWS[find_direction(name)]}", *cells)
+        table.add_row(f"{name}{ARROWS[find_direction(name)]}", *cells)
     return table
 
 
 def format_drive_comparison(comparison: DriveComparison) -> Table:
-    """A row per score: both means and the verdict."""
+    """A row per score: both means, the difference with its interval, and the verdict."""
     a, b = comparison.a, comparison.b
     models = {a.settings.model, b.settings.model} - {"none"}
     note = ", whose traffic models differ" if len(models) > 1 else ""
-    table = Table(title=f"{b.name} against {a.name}{note}", title_justify="left")
-    table.add_column("", no_wrap=True)
-    for name in (a.name, b.name):
-        table.add_column(name, justify="right")
-    table.add_column("verdict")
+    parts_a, parts_b = (a.settings.planner, a.settings.traffic), (b.settings.planner, b.settings.traffic)
+    # headings say what differs
+    differing = [names for names in zip(parts_a, parts_b) if names[0] != names[1]]
+    headings = differing[0] if len(differing) == 1 else (a.name, b.name)
+    table = comparison_table(*headings, max((row.alpha for row in comparison), default=0.05))
+    table.title = f"{b.name} against {a.name}{note}: {max(row.count for row in comparison)} scenarios in both"
     for row in comparison:
         if row.column in MAIN_SCORES and row.count:
-            label = f"{row.column} {ARROWS[find_direction(row.column)]}"
-            table.add_row(label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", row.verdict)
+            table.add_row(row.column, *row.cells)
     return table
