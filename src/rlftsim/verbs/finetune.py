@@ -114,8 +114,8 @@ def finetune(
             yes where goal conditioning is added, unchanged where the model has it.
         processes: Processes that train, in short for the method's device.processes.
         split: Split of the data set to train on.
-        validation_split: With catk and road: split to validate on in closed loop, see --catk.validation.every. Left
-            out: "validation", if the data set has it.
+        validation_split: With rlft, catk and road: split to validate on in closed loop, see
+            --finetune.validation.every. Left out: "tune", the part of "validation" that is not of the exam.
 
     Returns:
         The fine-tuned policy, ready to simulate.

@@ -111,8 +111,8 @@ def pretrain(
             those that its weights do not depend on, such as the number of neighbors. Left out: fresh weights.
         processes: Processes that train, in short for --pretrain.device.processes.
         split: Split of the data set to train on.
-        validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "validation",
-            if the data set has it.
+        validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "tune", the
+            part of "validation" that is not of the exam.
 
     Returns:
         The pre-trained policy, ready to simulate; a policy that was handed over stays as it is.
