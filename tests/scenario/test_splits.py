@@ -10,7 +10,7 @@ import scenes
 from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, write_dataset
 from rlftsim.scenario.splits import find_clusters, is_in_exam
-from rlftsim.scenario.synthetic.pack import pack_path
+from rlftsim.scenario.synthetic import pack_path
 
 EXAM_LOGS = [8, 9, 13, 15, 19, 21]
 

@@ -39,7 +39,7 @@ from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
 from rlftsim.scenario.splits import find_clusters, find_split
-from rlftsim.scenario.synthetic.pack import pack_path
+from rlftsim.scenario.synthetic import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
 
