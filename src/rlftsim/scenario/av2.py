@@ -20,14 +20,13 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
-from rlftsim.scenario.rows import INTEGERS, NOTES, NUMBERS, TRUTHS, WORDS, Rows, read_rows
+from rlftsim.scenario.rows import Rows, Schema, read_rows
 from rlftsim.scenario.source import BytesRead, Item, Tally, Unit
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
     MEDIAN_SIZE_M,
-    OTHER_SIZE_M,
     STEP_S,
     LightStates,
     MapFeatures,
@@ -63,21 +62,21 @@ SIZES_M = {
     "pedestrian": MEDIAN_SIZE_M[ObjectType.PEDESTRIAN],
     "cyclist": MEDIAN_SIZE_M[ObjectType.CYCLIST],
     "motorcyclist": (2.1, 0.9, 1.7),
-    UNNAMED: OTHER_SIZE_M,
+    UNNAMED: MEDIAN_SIZE_M[ObjectType.OTHER],
     EGO: (4.87, 1.85, 1.48),
 }
 """Length, width and height where no file of sizes is given; the ego has the size of the recording vehicles."""
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 FOCAL, SCORED = 3, 2
 _CUT_TRACKS = "tracks to predict not evaluated, as they leave the ground that the map covers"
-_NEEDED = (
-    dict.fromkeys(("track_id", "object_type", "scenario_id"), WORDS)
-    | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), NUMBERS)
-    | dict.fromkeys(("start_timestamp", "end_timestamp"), NUMBERS)
-    | dict.fromkeys(("object_category", "timestep", "num_timestamps"), INTEGERS)
-    | {"observed": TRUTHS}
+_SCHEMA: Schema = (
+    dict.fromkeys(("track_id", "object_type", "scenario_id"), "text")
+    | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), "numbers")
+    | dict.fromkeys(("start_timestamp", "end_timestamp"), "numbers")
+    | dict.fromkeys(("object_category", "timestep", "num_timestamps"), "whole numbers")
+    | {"observed": "True or False"},
+    dict.fromkeys(("city", "slice_id", "focal_track_id"), "text or nothing") | {"map_id": "numbers"},
 )
-_OPTIONAL = dict.fromkeys(("city", "slice_id", "focal_track_id"), NOTES) | {"map_id": NUMBERS}
 
 
 class Av2Source:
@@ -243,9 +242,9 @@ def _read_rows(file: Path) -> Rows:
         raise DataError(f"{file.name} is missing: get the file again") from None
     try:
         for name in table.schema.names:
-            if name not in _NEEDED | _OPTIONAL and not name.startswith("__index_level_"):
+            if not any(name in columns for columns in _SCHEMA) and not name.startswith("__index_level_"):
                 raise DataError(f"{file.name} has the unknown column {name}")
-        rows = read_rows(file.name, table, _NEEDED, _OPTIONAL)
+        rows = read_rows(file.name, table, _SCHEMA)
     except DataError as error:
         raise DataError(f"{error}: its schema is not the published one") from None
     if not len(rows):

@@ -36,8 +36,15 @@ from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import errors_name, write_atomically, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
-from rlftsim.scenario.index_row import AGENT_COLUMNS
-from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
+from rlftsim.scenario.shards import (
+    AGENT_COLUMNS,
+    INDEX_FIELDS,
+    SCHEMA_VERSION,
+    ShardReader,
+    ShardWriter,
+    check_scenario,
+    hash_file,
+)
 from rlftsim.scenario.splits import find_clusters, find_split
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -313,6 +320,7 @@ def _write_shards(
                     raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
                 if scenario.scenario_id in ids:
                     raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
+                check_scenario(scenario)
                 writer.add(scenario, split(scenario) if callable(split) else split)
                 ids.add(scenario.scenario_id)
         entries.append(describe_shard(folder, writer.path, writer.num_rows))

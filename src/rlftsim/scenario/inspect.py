@@ -20,8 +20,7 @@ from rlftsim.scenario.dataset import (
     load_index,
     read_manifest,
 )
-from rlftsim.scenario.index_row import AGENT_COLUMNS
-from rlftsim.scenario.shards import ShardReader, hash_file
+from rlftsim.scenario.shards import AGENT_COLUMNS, ShardReader, hash_file
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, STEP_S, ObjectType, Scenario
 
 TELEPORT_SPEED_MPS = 60.0

@@ -15,11 +15,11 @@ from starlette.types import ASGIApp
 
 from rlftsim.errors import RlftsimError
 from rlftsim.goals.goals_file import GoalEntry, parse_goals
+from rlftsim.studio import Refusal
 from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, Metric, OpenGoalsBody, RunBody, SaveGoalsBody
 from rlftsim.studio.exports import export, save_goals
 from rlftsim.studio.guard import Access, Guard
-from rlftsim.studio.imported import encode_imported, score_imported
-from rlftsim.studio.refusal import Refusal
+from rlftsim.studio.inputs import encode_imported, score_imported
 from rlftsim.studio.runs import Run, Worker, as_json
 from rlftsim.studio.session import Session
 from rlftsim.studio.variants import to_goal_entries
