@@ -29,7 +29,6 @@ from rlftsim.scenario.types import (
     MEDIAN_SIZE_M,
     STEP_S,
     LightStates,
-    MapFeatures,
     ObjectType,
     Scenario,
     Tracks,
@@ -189,49 +188,35 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
         raise DataError(f"{file.name}: there is no {_find_map(file).name} beside it")
     map_features, ground = read_map(_find_map(file))
     windows = WINDOWS[source.window] if num_steps == RECORDED_STEPS else TEST_WINDOW
-    recording, category, ego = _read_tracks(rows, num_steps, source, ground)
+    recording, categories, ego = _read_tracks(rows, num_steps, source, ground)
     for first, end in windows:
         suffix = f"-{first}" if len(windows) > 1 else ""
-        scenario_id = f"{rows['scenario_id'][0]}{suffix}"
-        yield _cut_window(scenario_id, recording, category, ego, slice(first, end), map_features, ground)
-
-
-def _cut_window(
-    scenario_id: str,
-    recording: Tracks,
-    category: np.ndarray,
-    ego: int,
-    window: slice,
-    map_features: MapFeatures,
-    ground: Ground,
-) -> tuple[Scenario, int]:
-    """Scenario of some steps of a recording, see `read_scenario`."""
-    indices = np.flatnonzero(recording.valid[:, window].any(1))
-    tracks = recording.select(indices).cut(window)
-    category, ego_indices = category[indices], np.flatnonzero(indices == ego)
-    if not len(ego_indices) or not tracks.valid[ego_indices[0], CURRENT_STEP]:
-        raise DataError(f"the ego (track AV) is not there at the current step ({window.start + CURRENT_STEP})")
-    predicted, num_cut = [], 0
-    for track in np.flatnonzero((category >= SCORED) & tracks.valid[:, CURRENT_STEP]):
-        path = tracks.position[track, HISTORY_STEPS - 1 :][tracks.valid[track, HISTORY_STEPS - 1 :]]
-        is_cut = ground.leaves_through_cut(path[:, :2].astype(np.float64))
-        num_cut += is_cut
-        if not is_cut:
-            predicted.append(track)
-    scenario = Scenario(
-        scenario_id=scenario_id,
-        timestamps_s=np.round(np.arange(tracks.valid.shape[1]) * STEP_S, 1),
-        tracks=tracks,
-        map_features=map_features,
-        lights=LightStates.of([]),
-        ego_index=int(ego_indices[0]),
-        tracks_to_predict=np.array(predicted, np.int32),
-        difficulty=np.zeros(len(predicted), np.int8),
-        objects_of_interest=tracks.object_id[category == FOCAL],
-        source="av2",
-        guessed=frozenset(("size", "z")),
-    )
-    return scenario, num_cut
+        indices = np.flatnonzero(recording.valid[:, first:end].any(1))
+        tracks = recording.select(indices).cut(slice(first, end))
+        category, ego_indices = categories[indices], np.flatnonzero(indices == ego)
+        if not len(ego_indices) or not tracks.valid[ego_indices[0], CURRENT_STEP]:
+            raise DataError(f"the ego (track AV) is not there at the current step ({first + CURRENT_STEP})")
+        predicted, num_cut = [], 0
+        for track in np.flatnonzero((category >= SCORED) & tracks.valid[:, CURRENT_STEP]):
+            path = tracks.position[track, HISTORY_STEPS - 1 :][tracks.valid[track, HISTORY_STEPS - 1 :]]
+            is_cut = ground.leaves_through_cut(path[:, :2].astype(np.float64))
+            num_cut += is_cut
+            if not is_cut:
+                predicted.append(track)
+        scenario = Scenario(
+            scenario_id=f"{rows['scenario_id'][0]}{suffix}",
+            timestamps_s=np.round(np.arange(tracks.valid.shape[1]) * STEP_S, 1),
+            tracks=tracks,
+            map_features=map_features,
+            lights=LightStates.of([]),
+            ego_index=int(ego_indices[0]),
+            tracks_to_predict=np.array(predicted, np.int32),
+            difficulty=np.zeros(len(predicted), np.int8),
+            objects_of_interest=tracks.object_id[category == FOCAL],
+            source="av2",
+            guessed=frozenset(("size", "z")),
+        )
+        yield scenario, num_cut
 
 
 def _read_rows(file: Path) -> Rows:

@@ -73,10 +73,7 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
 
 
 def read_scenarios(
-    source: str | os.PathLike[str],
-    on_error: OnError = "stop",
-    *,
-    report: Callable[[SkippedRecord], None] | None = None,
+    source: str | os.PathLike[str], on_error: OnError = "stop", *, report: Callable[[SkippedRecord], None] | None = None
 ) -> Iterator[Scenario]:
     """Read the scenarios of tfrecord files, in the order of paths and records.
 

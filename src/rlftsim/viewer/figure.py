@@ -242,13 +242,12 @@ def _axis(width: float, height: float, title: str) -> tuple[Figure, Axes]:
 CHART_INCHES = (4.6, 3.4)
 
 
-def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 120) -> None:
+def charts_to_png(path: Path, charts: Sequence[Chart]) -> None:
     """Draw charts side by side.
 
     Args:
         path: File to write (.png, .svg or .pdf); no half-written file is left.
         charts: Charts from left to right, at least one.
-        dots_per_inch: Resolution of a PNG; 120 makes a chart 552 pixels wide.
     """
     width, height = CHART_INCHES
     figure = Figure(figsize=(width * len(charts), height), layout="constrained")
@@ -268,4 +267,4 @@ def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 1
         if len(axis.get_legend_handles_labels()[1]) > 1:
             axis.legend(frameon=False, fontsize=8)
         axis.spines[["top", "right"]].set_visible(False)
-    save_figure(path, figure, dots_per_inch=dots_per_inch)
+    save_figure(path, figure, dots_per_inch=120)

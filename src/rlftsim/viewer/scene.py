@@ -17,13 +17,7 @@ from rlftsim.errors import DataError
 from rlftsim.geometry import boxes_overlap, heights_overlap
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.sources import find_attribution
-from rlftsim.scenario.types import (
-    CURRENT_STEP,
-    HISTORY_STEPS,
-    LightStates,
-    MapFeatureType,
-    Scenario,
-)
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, MapFeatureType, Scenario
 
 
 def compute_overlap(
@@ -51,42 +45,29 @@ def compute_overlap(
     """
     overlap = np.zeros(valid.shape, bool)  # [N, A, S]
     size = np.stack([length, width], axis=-1).astype(np.float64)
-    for n in range(len(valid)):
-        heights = None if z is None or height is None else (z[n], height)
-        _mark_rollout(overlap[n], position[n].astype(np.float64), heading[n], size, valid[n], ignore_from, heights)
-    return overlap
-
-
-def _mark_rollout(
-    overlap: Bool[np.ndarray, "A S"],
-    position: Float[np.ndarray, "A S 2"],
-    heading: Float[np.ndarray, "A S"],
-    size: Float[np.ndarray, "A 2"],
-    valid: Bool[np.ndarray, "A S"],
-    ignore_from: int | None,
-    heights: tuple[Float[np.ndarray, "A S"], Float[np.ndarray, "A"]] | None,
-) -> None:
-    """Mark one rollout's overlaps in `overlap`."""
     radius = np.linalg.norm(size, axis=-1) / 2  # [A], of the circle around a box
-    for agent in range(len(valid) - 1):
-        later_agents = slice(agent + 1, None)
-        gap = position[later_agents] - position[agent]  # [A - agent - 1, S, 2]
-        # Few pairs are so close that their circles touch; only these need the exact test.
-        is_close = (gap**2).sum(-1) < (radius[later_agents, None] + radius[agent]) ** 2
-        # k pairs of a later agent and a step
-        gap_row, step = np.nonzero(is_close & valid[later_agents] & valid[agent])
-        if not len(gap_row):
-            continue
-        row = gap_row + agent + 1
-        hit = boxes_overlap(gap[gap_row, step], heading[agent, step], heading[row, step], size[agent], size[row])
-        if heights is not None:
-            z, height = heights
-            hit &= heights_overlap(z[row, step] - z[agent, step], height[agent, None], height[row])
-        if ignore_from is not None:
-            # A stroller and its pusher overlap from the beginning, which is no collision.
-            hit &= ~np.isin(row, row[hit & (step == ignore_from)])
-        overlap[agent, step[hit]] = True
-        overlap[row[hit], step[hit]] = True
+    for n in range(len(valid)):
+        center = position[n].astype(np.float64)  # [A, S, 2]
+        for agent in range(len(size) - 1):
+            later_agents = slice(agent + 1, None)
+            gap = center[later_agents] - center[agent]  # [A - agent - 1, S, 2]
+            # Few pairs are so close that their circles touch; only these need the exact test.
+            is_close = (gap**2).sum(-1) < (radius[later_agents, None] + radius[agent]) ** 2
+            # k pairs of a later agent and a step
+            gap_row, step = np.nonzero(is_close & valid[n, later_agents] & valid[n, agent])
+            if not len(gap_row):
+                continue
+            row = gap_row + agent + 1
+            headings = heading[n, agent, step], heading[n, row, step]
+            hit = boxes_overlap(gap[gap_row, step], *headings, size[agent], size[row])
+            if z is not None and height is not None:
+                hit &= heights_overlap(z[n, row, step] - z[n, agent, step], height[agent, None], height[row])
+            if ignore_from is not None:
+                # A stroller and its pusher overlap from the beginning, which is no collision.
+                hit &= ~np.isin(row, row[hit & (step == ignore_from)])
+            overlap[n, agent, step[hit]] = True
+            overlap[n, row[hit], step[hit]] = True
+    return overlap
 
 
 SIMPLIFY_TOLERANCE_M = 0.1
