@@ -252,8 +252,8 @@ def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures
                 size[track, :, column] = rows[name][span][row_index]
         reversed_step = _find_reversed(states[track], valid[track]) if types[track] != ObjectType.PEDESTRIAN else None
         if reversed_step is not None:
-            raise rows.error(start + row_index[reversed_step], f"object {ids[start]} moves against its heading "
-                             f"faster than {MOVING_MPS:g} m/s for more than {REVERSED_S:g} s")  # fmt: skip
+            motion = f"moves against its heading faster than {MOVING_MPS:g} m/s for more than {REVERSED_S:g} s"
+            raise rows.error(start + row_index[reversed_step], f"object {ids[start]} {motion}")
     if "z" in rows:
         z = states[..., 5]
     else:
@@ -320,7 +320,7 @@ def _find_indices(row: Rows, name: str, tracks: Tracks) -> list[int] | None:
     ids = row.first(name)
     if ids is None:
         return None
-    index = {int(object_id): k for k, object_id in enumerate(tracks.object_id)}
+    index = {object_id: k for k, object_id in enumerate(tracks.object_id.tolist())}
     for object_id in ids:
         if object_id not in index:
             raise row.error(0, f"{name} lists object {object_id}, which has no state in the scenario")
@@ -393,12 +393,9 @@ def _check_edge_directions(rows: Rows, features: MapFeatures) -> None:
         is_close = distance < NEAR_LANE_M
         is_right = direction[:, 0] * towards[:, 1] - direction[:, 1] * towards[:, 0] < 0
         if is_right[is_close].sum() > WRONG_SIDE * max(is_close.sum(), 1):
-            feature_id = features.feature_id[index]
-            raise rows.error(
-                np.flatnonzero(rows["feature_id"] == feature_id)[0],
-                f"road edge {feature_id} has the lanes on its right (outer edges run counter-clockwise, those of "
-                "islands clockwise): reverse its points",
-            )
+            ids, rule = rows["feature_id"], "outer edges run counter-clockwise, those of islands clockwise"
+            cause = f"road edge {{}} has the lanes on its right ({rule}): reverse its points"
+            rows.check(ids == features.feature_id[index], cause, ids)
 
 
 def _read_lights(

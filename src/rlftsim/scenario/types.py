@@ -298,10 +298,9 @@ class Scenario:
             DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
         features = self.map_features
-        _check_shapes(self.tracks, "tracks")
-        _check_shapes(features, "map")
-        _check_shapes(features.topology, "topology")
-        _check_shapes(self.lights, "lights")
+        tables = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
+        for name, table in tables.items():
+            _check_shapes(table, name)
 
     def check_consistency(self) -> None:
         """Check what every reader relies on: steps of 0.1 s, track indices, ids that differ, types, states, sizes, map.
