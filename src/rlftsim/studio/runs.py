@@ -135,10 +135,8 @@ def split_rollouts(num_rollouts: int) -> list[range]:
 def join_chunks(chunks: list[Rollouts]) -> Rollouts:
     """Rollouts of all chunks of a variant on the CPU; goals and draws are left out."""
 
-    def join(name: str) -> Tensor:
-        return torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu()
-
-    return Rollouts(join("position"), join("heading"), join("decision"), join("decision_mask"), join("log_prob"))
+    names = ("position", "heading", "decision", "decision_mask", "log_prob")
+    return Rollouts(**{name: torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu() for name in names})
 
 
 class Worker:

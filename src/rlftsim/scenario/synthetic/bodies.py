@@ -12,9 +12,8 @@ import numpy as np
 import pyarrow.csv
 from jaxtyping import Float
 
-from rlftsim.scenario.synthetic.demand import RoadUserType, draw_size
 from rlftsim.scenario.synthetic.network import Lane, Network
-from rlftsim.scenario.synthetic.sumo import DISCARDED_S
+from rlftsim.scenario.synthetic.sumo import DISCARDED_S, RoadUserType, draw_size
 from rlftsim.scenario.types import STEP_S, ObjectType
 
 REAR_AXLE_FROM_BUMPER = 0.78
