@@ -34,7 +34,7 @@ from rlftsim.evaluation.resumable import (
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
 from rlftsim.viewer.film import to_film

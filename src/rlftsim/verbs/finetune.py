@@ -11,7 +11,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
 from rlftsim.rollout.policy import Policy
-from rlftsim.scenario.any_form import to_scenarios
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig

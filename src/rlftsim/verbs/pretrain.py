@@ -10,7 +10,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.policy import Policy, get_device
-from rlftsim.scenario.any_form import to_scenarios
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
