@@ -14,7 +14,7 @@ import difflib
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -339,3 +339,18 @@ def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, s
     """
     expected = outline(make)
     check_shapes(strip_wrappers(weights, expected), expected, source=source)
+
+
+def are_frozen_alike(weights: Iterable[Tensor], reference: Iterable[Tensor]) -> bool:
+    """True if the weights of two models are equal, and no weight requires a gradient.
+
+    Args:
+        weights: Weights of the first model.
+        reference: Weights of the second model, in the same order and of the same shapes.
+    """
+    pairs = list(zip(weights, reference, strict=True))
+    if any(weight.requires_grad for pair in pairs for weight in pair):
+        return False
+    # a single tensor, which the host waits for once
+    differs = [(weight != counterpart).any() for weight, counterpart in pairs if weight is not counterpart]
+    return not differs or not bool(torch.stack(differs).any())

@@ -4,9 +4,7 @@
 `score_batch_features` and `AgentScores`, where several readers share the features. Independent of models and rewards.
 """
 
-from rlftsim.realism.agent_scores import AgentScores
 from rlftsim.realism.agents import SimulatedStates
-from rlftsim.realism.batch import ScenarioFeatures, compute_batch_features, score_batch, score_batch_features
 from rlftsim.realism.config import (
     FEATURE_NAMES,
     METRIC_2023,
@@ -17,9 +15,17 @@ from rlftsim.realism.config import (
     MetricConfig,
     metric_by_name,
 )
-from rlftsim.realism.credit import Credit, compute_credit, compute_single_credit
+from rlftsim.realism.credit import AgentScores, Credit, compute_credit, compute_single_credit
 from rlftsim.realism.features import ComputeConfig, Features, ScenarioLog, compute_features, scenario_log
-from rlftsim.realism.meta_metric import RealismResult, score, score_features
+from rlftsim.realism.meta_metric import (
+    RealismResult,
+    ScenarioFeatures,
+    compute_batch_features,
+    score,
+    score_batch,
+    score_batch_features,
+    score_features,
+)
 
 __all__ = [
     "FEATURE_NAMES",

@@ -23,9 +23,13 @@ from rlftsim.realism.agents import (
     join_history,
     join_trajectories,
 )
-from rlftsim.realism.displacement import compute_displacement_error
 from rlftsim.realism.interactive import PlanarAgents, compute_distance_to_nearest_object, compute_time_to_collision
-from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity
+from rlftsim.realism.kinematic import (
+    compute_displacement_error,
+    compute_ground_speed,
+    compute_kinematics,
+    shrink_validity,
+)
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge, join_road_edges
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation, join_signals
 from rlftsim.scenario.derived import cached_on_scenario

@@ -9,11 +9,18 @@ import pytest
 import torch
 from public_names import UNUSED
 
-from rlftsim.policies.trafficbots.attention import KeyValues, PolylineEncoder, PoseAttention
-from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
+from rlftsim.policies.trafficbots.attention import (
+    KeyValues,
+    Neighbors,
+    PolylineEncoder,
+    PoseAttention,
+    find_neighbors,
+    pose_embedding,
+    relative_pose,
+)
 from rlftsim.policies.trafficbots.network import Windows, agent_attributes, segment_features
-from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
 from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.policies.trafficbots.state import leaves_map, max_action, move, reaches_destination
 from rlftsim.rollout.policy import Sampling
 
 both = pytest.mark.parametrize("name", ["A", "B"])

@@ -15,8 +15,7 @@ from rlftsim.policies.trafficbots.destinations import (
     destination_labels,
 )
 from rlftsim.policies.trafficbots.map_tokens import cut_line, sides_of_polygon, tokenize_lights, tokenize_map
-from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.tracks import agent_motions
+from rlftsim.policies.trafficbots.scene import agent_motions, build_scene
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import HISTORY_STEPS, TOTAL_STEPS, LightStates
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from public_names import UNUSED, our_names
 
-from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.imitation import TrainingDraws, compute_scene_loss, imitation_terms, personality_kl
+from rlftsim.policies.trafficbots.state import max_action, move
 
 pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")]
 TERMS = ("imitation", "personality", "destination", "light")

@@ -1,5 +1,7 @@
 """A policy with a vocabulary, calibrated: eta · f(state, token) on the logits, with named features f.
 
+A model folder has a `calibration.json`: weight and gain of each feature, and the changes on the scenarios held back.
+
 B scenarios, N rollouts, A agents, L decisions, K features.
 """
 
@@ -15,11 +17,10 @@ from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import write_text
-from rlftsim.policies.calibrated.distribution import TiltedDistribution
-from rlftsim.policies.calibrated.features import features_by_name
-from rlftsim.policies.calibrated.table import calibration_table, read_calibration
-from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
+from rlftsim.policies.calibrated.candidates import Scene, Traffic, build_scene, join_moments
+from rlftsim.policies.calibrated.features import TiltedDistribution, features_by_name
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
 from rlftsim.policies.registry import load_policy
@@ -28,6 +29,16 @@ from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import STEP_S
 
+CHANGES = {
+    "rmm": ("RMM", "+.4f"),
+    "kinematic": ("kinematic", "+.4f"),
+    "interactive": ("interactive", "+.4f"),
+    "map_based": ("map-based", "+.4f"),
+    "min_ade": ("minADE (m)", "+.3f"),
+    "speed": ("speed (m/s)", "+.3f"),
+    "evaluated_speed": ("of evaluated agents (m/s)", "+.3f"),
+}
+"""Heading and format of each change that is shown."""
 BASE = "base"
 """Model folder of the policy that is calibrated, inside the folder of the calibrated one."""
 CALIBRATION = "calibration.json"
@@ -37,6 +48,61 @@ PASSED_ON = (
     *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary"),
 )
 """Attributes that a calibrated policy passes on from the base, if the base has these."""
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """Values of a calibration.json.
+
+    Raises:
+        FileNotFoundError: No such file.
+        CheckpointError: Damaged file, or values that are no calibration.
+    """
+    calibration = read_json(path, "remove it", error=CheckpointError)
+    try:
+        calibration_table(calibration)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise CheckpointError(f"{path}: no calibration of this version: remove it.") from None
+    return calibration
+
+
+def calibration_table(calibration: Mapping[str, Any]) -> str:
+    """Markdown of a calibration.
+
+    Args:
+        calibration: Values of calibration.json, as `training.calibrate` writes these.
+    """
+    num_fitted, num_held_back = calibration["num_scenarios"]
+    scores = ("rmm", "kinematic", "interactive", "map_based")
+    features = [
+        [row["feature"], f"{row['eta']:+.3f}", f"{row['t']:+.1f}", *(f"{row[name]:+.4f}" for name in scores)]
+        for row in sorted(calibration["features"], key=lambda row: -row["rmm"])
+    ]
+    lengths = [
+        [f"{row['length']:g}", f"{row['kl']:.4f}", *(_with_t(row[name], style) for name, (_, style) in CHANGES.items())]
+        for row in calibration["held_back"]
+    ]
+    return f"""## Calibration
+
+What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {num_fitted} scenarios with
+{calibration["num_rollouts"]} rollouts each; t is that of its gradient over scenarios.
+Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "nothing"}.
+
+{_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), features)}
+
+Measured on {num_held_back} scenarios that were held back, with t in parentheses. The length taken is
+{calibration["length"]:.2f}.
+
+{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), lengths)}
+"""
+
+
+def _with_t(change: Mapping[str, float], style: str) -> str:
+    return f"{change['change']:{style}} ({change['t']:+.1f})"
+
+
+def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    rule = ["---", *["--:"] * (len(headings) - 1)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, rule, *rows))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,21 +2,28 @@
 
 policy = import_catk(Path("clsft.ckpt"), [Path("agent_vocab.npz"), Path("map_vocab.npz")]).policy
 policy.save_pretrained(Path("models/clsft"))
+
+Lightning checkpoints are pickles, read through torch's restricted unpickler without running code of the file. The few
+foreign classes that hold settings (OmegaConf) are replaced by name with an inert stand-in, all further classes are
+refused.
 """
 
-from collections.abc import Sequence
+import collections
+import typing
+import zipfile
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError, printable
 from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.documents import first_line
 from rlftsim.jobs.files import save_tensors
 from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
-from rlftsim.policies.smart.catk_keys import PREFIX, catk_name, find_aliases
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
     PUBLISHED_NUM_TOKENS,
@@ -24,13 +31,69 @@ from rlftsim.policies.smart.catk_vocabulary import (
     read_catk_vocabulary,
 )
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
-from rlftsim.policies.smart.lightning_file import find_group, read_lightning
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.tokens.vocabulary import MAX_TOKENS, STEPS_PER_TOKEN
 
+_FOREIGN = (
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    "omegaconf.nodes.AnyNode",
+    "omegaconf.base.ContainerMetadata",
+    "omegaconf.base.Metadata",
+)
+_HARMLESS = {
+    "typing.Any": typing.Any,
+    "collections.defaultdict": collections.defaultdict,
+    "builtins.list": list,
+    "builtins.dict": dict,
+    "builtins.int": int,
+}
+PREFIX = "encoder."
+_PLAIN, _MLP, _FOURIER, _ATTENTION = "plain", "mlp", "fourier", "attention"
+_SUBMODULES = (
+    ("map_encoder.feature_type", "map_encoder.type_pt_emb", _PLAIN),
+    ("map_encoder.kind", "map_encoder.polygon_type_emb", _PLAIN),
+    ("map_encoder.light", "map_encoder.light_pl_emb", _PLAIN),
+    ("map_encoder.token", "map_encoder.token_emb", _MLP),
+    ("map_encoder.relation", "map_encoder.r_pt2pt_emb", _FOURIER),
+    ("map_encoder.layers", "map_encoder.pt2pt_layers", _ATTENTION),
+    ("decoder.class_embedding", "agent_encoder.type_a_emb", _PLAIN),
+    ("decoder.size", "agent_encoder.shape_emb", _MLP),
+    ("decoder.tokens.0", "agent_encoder.token_emb_veh", _MLP),
+    ("decoder.tokens.1", "agent_encoder.token_emb_ped", _MLP),
+    ("decoder.tokens.2", "agent_encoder.token_emb_cyc", _MLP),
+    ("decoder.motion", "agent_encoder.x_a_emb", _FOURIER),
+    ("decoder.fusion", "agent_encoder.fusion_emb", _MLP),
+    ("decoder.time_relation", "agent_encoder.r_t_emb", _FOURIER),
+    ("decoder.map_relation", "agent_encoder.r_pt2a_emb", _FOURIER),
+    ("decoder.agent_relation", "agent_encoder.r_a2a_emb", _FOURIER),
+    ("decoder.time_layers", "agent_encoder.t_attn_layers", _ATTENTION),
+    ("decoder.map_layers", "agent_encoder.pt2a_attn_layers", _ATTENTION),
+    ("decoder.agent_layers", "agent_encoder.a2a_attn_layers", _ATTENTION),
+    ("decoder.head", "agent_encoder.token_predict_head", _MLP),
+)
+"""Prefix of a submodule of the network here, its prefix in the public code, and the type of the submodule."""
+_IN_FOURIER = {"frequencies": "freqs", "inputs": "mlps", "out": "to_out"}
+_IN_ATTENTION = {
+    "query": "to_q",
+    "source_key": "to_k",
+    "relation_key": "to_k_r",
+    "source_value": "to_v",
+    "relation_value": "to_v_r",
+    "skip": "to_s",
+    "gate": "to_g",
+    "out": "to_out",
+    "target_norm": "attn_prenorm_x_dst",
+    "source_norm": "attn_prenorm_x_src",
+    "relation_norm": "attn_prenorm_r",
+    "out_norm": "attn_postnorm",
+    "feed_forward.0": "ff_prenorm",
+    "feed_forward.1": "ff_mlp.0",
+    "feed_forward.4": "ff_mlp.3",
+    "feed_forward.5": "ff_postnorm",
+}
 PRESETS = {"nano": smart_nano, "mini": smart_mini, "tiny": smart_tiny}
-
 _FIELD_OF_SETTING = {
     "hidden_dim": "dim",
     "num_freq_bands": "num_frequencies",
@@ -46,6 +109,112 @@ _FIELD_OF_SETTING = {
 }
 _SHAPE_PROBE = PREFIX + "agent_encoder.t_attn_layers.0.to_q.weight"
 _HEAD_BIAS = PREFIX + "agent_encoder.token_predict_head.mlp.3.bias"
+
+
+class _Inert:
+    """Stand-in for foreign classes: holds the state of an object and runs no code."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+
+def read_lightning(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights of a Lightning checkpoint, and the file's `hyper_parameters` as plain dictionaries, lists and values.
+
+    Raises:
+        CheckpointError: No such file, not a checkpoint, no weights inside, or objects that would have to run code to
+            be read.
+    """
+    content = _unpickle(path)
+    weights = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(weights, dict) or not all(_is_weight(k, v) for k, v in weights.items()):
+        raise CheckpointError(f"{path}: no weights under 'state_dict': is it a Lightning checkpoint of a model?")
+    try:
+        settings = _plain(content.get("hyper_parameters", {}))
+    except RecursionError:
+        raise CheckpointError(f"{path}: damaged, its settings hold themselves: get the file again.") from None
+    return dict(weights), settings if isinstance(settings, dict) else {}
+
+
+def find_group(settings: dict[str, Any], name: str) -> dict[str, Any]:
+    """Group of settings of a name; empty where there is none."""
+    group = settings.get(name)
+    return group if isinstance(group, dict) else {}
+
+
+def _is_weight(name: object, value: Any) -> bool:
+    """True for a dense tensor on the CPU with all values stored: views may announce more than memory holds."""
+    if not isinstance(name, str) or type(value) not in (Tensor, nn.Parameter) or value.layout != torch.strided:
+        return False
+    return value.device.type == "cpu" and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
+
+
+def _unpickle(path: Path) -> Any:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file.")
+    try:
+        if not zipfile.is_zipfile(path):
+            raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
+        with zipfile.ZipFile(path) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise CheckpointError(f"{path}: packed, which torch.save never does: unpack it, or get the file again.")
+        # list the classes that the pickle names before any is made
+        named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+        refused = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
+        if refused:
+            raise CheckpointError(f"{path}: refused, it holds {', '.join(refused)}: save it again with weights only.")
+        # then let torch's restricted unpickler make the harmless classes, and stand-ins for the foreign
+        classes: Any = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
+        with torch.serialization.safe_globals(classes):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except CheckpointError:
+        raise
+    except Exception as error:  # whatever damage makes of the code that reads it
+        reason = first_line(error)
+        raise CheckpointError(f"{path}: damaged or not a checkpoint ({reason}): get the file again.") from None
+
+
+def _plain(value: Any) -> Any:
+    """Settings as plain dictionaries, lists and values; values of other types become None."""
+    if isinstance(value, _Inert):
+        # OmegaConf keeps containers in `_content` and values in `_val`
+        state = value.__dict__
+        return _plain(state["_content"] if "_content" in state else state.get("_val"))
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, str | int | float | bool) else None
+
+
+def catk_name(key: str) -> str:
+    """The public code's name of a weight of this package."""
+    # the longest prefix, as "decoder.tokens.1" is also a prefix of "decoder.tokens.10"
+    submodules = (entry for entry in _SUBMODULES if key.startswith(entry[0] + "."))
+    prefix, catk_prefix, module_type = max(submodules, key=lambda entry: len(entry[0]))
+    name = key[len(prefix) + 1 :]
+    if module_type == _MLP:
+        name = f"mlp.{name}"
+    elif module_type == _FOURIER:
+        first, _, parameter = name.partition(".")
+        name = f"{_IN_FOURIER[first]}.{parameter}"
+    elif module_type == _ATTENTION:
+        layer, _, name = name.partition(".")
+        module, _, parameter = name.rpartition(".")
+        name = f"{layer}.{_IN_ATTENTION[module]}.{parameter}"
+    return f"{PREFIX}{catk_prefix}.{name}"
+
+
+def find_aliases(names: Iterable[str]) -> dict[str, str]:
+    """Second names of weights that the public code stores twice, each with the first name.
+
+    There a single norm serves both ends of most relations.
+    """
+    return {
+        name.replace(".attn_prenorm_x_dst.", ".attn_prenorm_x_src."): name
+        for name in names
+        if ".attn_prenorm_x_dst." in name and ".pt2a_attn_layers." not in name
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from rlftsim.policies.distributions import NEVER
 from rlftsim.policies.smart.embeddings import MlpLayer
-from rlftsim.policies.token_rows import NEVER
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, box_of_class
 
 PERIODS = ((12.8, 0.05, 12), (3.2, 0.03, 10), (6.25, 0.06, 10))

@@ -16,9 +16,14 @@ from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.folder import check_folder
-from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
-from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
-from rlftsim.policies.sharing import are_frozen_alike
+from rlftsim.policies.checkpoint import are_frozen_alike, check_fit, load_strictly, read_model, save_model
+from rlftsim.policies.distributions import (
+    NEVER,
+    CategoricalDistribution,
+    LazyTokenDistribution,
+    TokenDistribution,
+    TokenRows,
+)
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import normalize
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
@@ -26,7 +31,6 @@ from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.neighbors import bound_neighbors
 from rlftsim.policies.smart.network import Scene, SmartNetwork, mask_positions
 from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
-from rlftsim.policies.token_rows import NEVER, TokenRows
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents

@@ -23,7 +23,6 @@ from torch.nn.functional import pad, smooth_l1_loss
 
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
-from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.network import (
     POSTERIOR_STRIDE,
     AgentConditioning,
@@ -33,7 +32,7 @@ from rlftsim.policies.trafficbots.network import (
     history_windows,
 )
 from rlftsim.policies.trafficbots.scene import Scene, build_scene
-from rlftsim.policies.trafficbots.state import ImposedStates, join_history, start_traffic
+from rlftsim.policies.trafficbots.state import ImposedStates, join_history, max_action, move, start_traffic
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, TOTAL_STEPS

@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
-from rlftsim.policies.sharing import are_frozen_alike
+from rlftsim.policies.checkpoint import are_frozen_alike, check_fit, load_strictly, read_model, save_model
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import VEHICLE
 from rlftsim.policies.trafficbots.network import TrafficBotsNetwork

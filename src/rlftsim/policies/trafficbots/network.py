@@ -17,11 +17,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from rlftsim.policies.precision import at_least_float32
-from rlftsim.policies.trafficbots.attention import DecoderLayer, KeyValues, PolylineEncoder, SelfLayer
+from rlftsim.policies.distributions import at_least_float32
+from rlftsim.policies.trafficbots.attention import (
+    DecoderLayer,
+    KeyValues,
+    Neighbors,
+    PolylineEncoder,
+    SelfLayer,
+    find_neighbors,
+    pose_embedding,
+    relative_pose,
+)
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, WINDOW, TrafficBotsConfig
 from rlftsim.policies.trafficbots.map_tokens import NUM_LIGHT_STATES, NUM_NODES, VEHICLE_LANES, MapTokenType
-from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.scenario.types import TOTAL_STEPS
 

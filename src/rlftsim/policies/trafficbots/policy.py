@@ -19,7 +19,6 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.distributions import GaussianDistribution, standard_normal
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import PEDESTRIAN
-from rlftsim.policies.trafficbots.dynamics import max_action
 from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
 from rlftsim.policies.trafficbots.network import NUM_CLASSES, history_windows
@@ -30,6 +29,7 @@ from rlftsim.policies.trafficbots.state import (
     TrafficBotsState,
     compute_imposed_states,
     join_history,
+    max_action,
     start_traffic,
 )
 from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
