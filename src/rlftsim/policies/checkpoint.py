@@ -17,7 +17,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -326,19 +326,24 @@ def outline(make: Callable[[], nn.Module]) -> dict[str, Tensor]:
         return make().state_dict()
 
 
-def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Check that weights fit a network before the network is built: damaged settings may ask for any memory.
+def load_network(make: Callable[[], Loaded], weights: Mapping[str, Tensor], *, source: Path) -> Loaded:
+    """Policy whose `network` has the given weights.
+
+    The weights are compared with an outline before the policy is built: damaged settings may ask for any memory.
 
     Args:
-        make: Function that builds the network on torch's default device, which has no memory here.
-        weights: Stored weights by name.
-        source: File or folder of the weights, which the message of an error names.
+        make: Function that builds the policy on torch's default device.
+        weights: Stored weights of the network by name.
+        source: Folder of the weights, which the message of an error names.
 
     Raises:
-        CheckpointError: The weights have other names, shapes or number types.
+        CheckpointError: The weights have other names, shapes or number types, or are not finite.
     """
-    expected = outline(make)
-    check_shapes(strip_wrappers(weights, expected), expected, source=source)
+    expected = outline(lambda: cast(Any, make()).network)
+    check_shapes(strip_wrappers(weights, expected), expected, source=str(source))
+    policy: Any = make()
+    load_strictly(policy.network, weights, source=str(source))
+    return policy
 
 
 def are_frozen_alike(weights: Iterable[Tensor], reference: Iterable[Tensor]) -> bool:

@@ -268,14 +268,10 @@ def match_agents(
     if missing_ids or unlogged_ids or len(rollout_ids) != len(logged_ids):
         unique, counts = np.unique(rollout_ids, return_counts=True)
         repeated_ids = unique[counts > 1].tolist()
-        reasons = (
-            ("listed twice", repeated_ids),
-            ("missing", missing_ids),
-            ("not simulated in this scenario", unlogged_ids),
-        )
+        reasons = {"listed twice": repeated_ids, "missing": missing_ids, "not simulated in this scenario": unlogged_ids}
         raise DataError(
             f"Rollouts of scenario {scenario_id} must hold every track valid at the current step and no other: "
-            f"object ids {'; '.join(f'{reason} {_shorten(ids)}' for reason, ids in reasons if ids)}."
+            f"object ids {'; '.join(f'{reason} {_shorten(ids)}' for reason, ids in reasons.items() if ids)}."
         )
     return order[np.searchsorted(rollout_ids[order], logged_ids)]
 

@@ -213,6 +213,6 @@ class AgentScores:
             if layout is not None:
                 # From the index among the agents of all scenarios to that in the padded batch.
                 index = index - layout.first_agent[layout.scenario] + layout.scenario * self.num_agents
-            row = values.new_zeros(len(values), len(scene.log.scenario_ids) * self.num_agents)
+            row = values.new_zeros(len(values), len(scene.log.logs) * self.num_agents)
             rows.append(row.index_copy(1, index, values).view(len(values), -1, self.num_agents))
         return torch.cat(rows, 1).transpose(0, 1)

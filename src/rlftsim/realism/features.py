@@ -122,9 +122,9 @@ class ScenarioLog:
     """Features of the log, N = 1."""
 
     @property
-    def scenario_ids(self) -> tuple[str, ...]:
-        """The scenario's id, as the only entry."""
-        return (self.scenario_id,)
+    def logs(self) -> "tuple[ScenarioLog, ...]":
+        """The log itself, as the only entry."""
+        return (self,)
 
     @property
     def leaves_road(self) -> Bool[Tensor, "E"]:
@@ -150,11 +150,6 @@ class JoinedLogs:
             join_road_edges([log.road_edges for log in logs]),
             join_signals([log.signals for log in logs]),
         )
-
-    @property
-    def scenario_ids(self) -> tuple[str, ...]:
-        """Ids of the scenarios."""
-        return tuple(log.scenario_id for log in self.logs)
 
     @property
     def leaves_road(self) -> Bool[Tensor, "E"]:
@@ -246,11 +241,10 @@ def compute_features(
     Raises:
         DataError: The agents of the rollouts are not the scenario's simulated agents.
     """
-    logs = log.logs if isinstance(log, JoinedLogs) else (log,)
     states = [states] if isinstance(states, SimulatedStates) else states
     histories = [
         join_history(scene.agents, rollouts, NUM_HISTORY_STEPS, scene.scenario_id)
-        for scene, rollouts in zip(logs, states)
+        for scene, rollouts in zip(log.logs, states)
     ]
     trajectories = histories[0] if len(histories) == 1 else join_trajectories(histories)  # [N, A, 82]
     max_pairs = compute.pairs_on(states[0].device)
@@ -321,23 +315,17 @@ def _compute_interaction(
 
 
 def _compute_road_edge(
-    future: Trajectories,
-    agents: LoggedAgents,
-    road_edges: RoadEdges | None,
-    valid: Bool[Tensor, "N E T"],
-    max_pairs: int,
+    future: Trajectories, agents: LoggedAgents, edges: RoadEdges | None, valid: Bool[Tensor, "N E T"], max_pairs: int
 ) -> Float[Tensor, "N E T"]:
-    if road_edges is None:
+    if edges is None:
         return torch.full_like(future.x, INVALID_ROAD_EDGE_M)
     size = agents.size.index_select(0, agents.evaluated)
     # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
     # the current position instead; their distance is overwritten below.
     current = agents.trajectories.select_agents(agents.evaluated)
-    filled_states = Trajectories(
-        *(torch.where(valid, x, logged[:, CURRENT_STEP, None]) for x, logged in zip(future, current))
-    )
+    states = Trajectories(*(torch.where(valid, x, log[:, CURRENT_STEP, None]) for x, log in zip(future, current)))
     scenario = None if agents.layout is None else agents.layout.scenario
-    distance = compute_distance_to_road_edge(filled_states, size, road_edges, max_pairs=max_pairs, scenario=scenario)
-    if scenario is not None and road_edges.has_edges is not None:
-        valid = valid & road_edges.has_edges[scenario, None]
+    distance = compute_distance_to_road_edge(states, size, edges, max_pairs=max_pairs, scenario=scenario)
+    if scenario is not None and edges.has_edges is not None:
+        valid = valid & edges.has_edges[scenario, None]
     return torch.where(valid, distance, INVALID_ROAD_EDGE_M)

@@ -144,8 +144,9 @@ def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "
     return torch.stack([speed, acceleration, speed, acceleration, valid, collision_time, valid])
 
 
-def build_log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
-    """Bins and outcomes of the log.
+@lru_cache(maxsize=CACHED_LOGS)
+def log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
+    """Bins and outcomes of the log, cached (logs are compared by identity).
 
     Args:
         log: Logged side of the scenario, or of several side by side.
@@ -165,10 +166,6 @@ def build_log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
     bins = find_bins(values.flatten(1), table).view(values.shape)
     steps_in_bin = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, is_scored)
     return LogTarget(steps_in_bin, is_scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
-
-
-log_target = lru_cache(maxsize=CACHED_LOGS)(build_log_target)
-"""`build_log_target`, cached (logs are compared by identity)."""
 
 
 @dataclass(frozen=True, eq=False)

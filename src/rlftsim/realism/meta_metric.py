@@ -180,7 +180,7 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     num_staying = sum_over_agents(stays_on_road.to(torch.float32), log.agents.layout)
     light = _compute_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
-        scenario_ids=log.scenario_ids,
+        scenario_ids=tuple(scene.scenario_id for scene in log.logs),
         config=config,
         likelihoods=likelihoods[0],
         meta_metric=meta_metric,

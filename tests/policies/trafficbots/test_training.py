@@ -143,13 +143,13 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
     mean = network.posterior(logged, scene.light_state[:, None, :, ::5], scene, map_features)
     personality = mean + network.posterior.log_std.exp() * draws.noise
     given = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
-    around = network.agents.context(map_features, lights[:, 10:])
+    around = network.agents.context(scene, map_features, lights[:, 10:])
     traffic, limit = start_traffic(scene, labels[:, None]), max_action(scene.agent_class)[:, None]
     pose, speed = traffic.windows.pose[..., -1, :], traffic.windows.motion[..., -1, 0]
     losses, counted = [], []
     for step in range(11, 91):
         now = around.select_steps(slice(step - 11, step - 10))
-        features = network.features(traffic.windows.add_decision_axis(), scene, now, given, traffic.active[:, None])
+        features = network.features(traffic.windows.add_decision_axis(), now, given, traffic.active[:, None])
         action = network.mean_actions(features, scene)[:, 0]
         pose, motion = move(pose, speed, torch.where(traffic.alive[..., None], action, 0.0), limit)
         own_pose, own_motion = scene.pose[:, None, :, step], scene.motion[:, None, :, step]

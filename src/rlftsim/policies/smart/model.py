@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.folder import check_folder
-from rlftsim.policies.checkpoint import are_frozen_alike, check_fit, load_strictly, read_model, save_model
+from rlftsim.policies.checkpoint import are_frozen_alike, load_network, load_strictly, read_model, save_model
 from rlftsim.policies.distributions import (
     NEVER,
     CategoricalDistribution,
@@ -171,10 +171,7 @@ class SmartModel(nn.Module):
         if not path.exists():
             raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
         vocabulary = Vocabulary.load(path)
-        check_fit(lambda: cls(config, vocabulary).network, weights, source=str(model.folder))
-        policy = cls(config, vocabulary)
-        load_strictly(policy.network, weights, source=str(model.folder))
-        return policy
+        return load_network(lambda: cls(config, vocabulary), weights, source=model.folder)
 
     # ---- parts of a forward pass ----------------------------------------------------------------------------------
 

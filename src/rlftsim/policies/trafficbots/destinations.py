@@ -5,7 +5,7 @@ Frame: ego. Shapes: A agents, M map tokens.
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from rlftsim.policies.trafficbots.map_tokens import VEHICLE_LANES, MapTokens, MapTokenType, tokenize_map
 from rlftsim.policies.trafficbots.scene import agent_motions
@@ -22,34 +22,9 @@ MAX_LANE_DISTANCE_M = 3.0
 LOOKAHEAD_S = 5.0
 """Time for which an agent that is on no lane is taken to go on at the last speed."""
 MAX_WALK_LANES = 3
-
-
-class Nodes:
-    """Nodes of the map tokens of given types."""
-
-    def __init__(self, tokens: MapTokens, types: tuple[int, ...]):
-        mask: Bool[np.ndarray, "M 20"] = tokens.node_mask & np.isin(tokens.type, types)[:, None]
-        self.token = np.nonzero(mask)[0]  # [n]
-        self.position = tokens.position[mask][:, :2]
-        self.direction = tokens.direction[mask][:, :2]
-
-    def nearest(self, point: Float64[np.ndarray, "2"]) -> int:
-        """Token of the nearest node; `NO_DESTINATION` without nodes."""
-        if not len(self.token):
-            return NO_DESTINATION
-        return int(self.token[np.linalg.norm(self.position - point, axis=1).argmin()])
-
-    def nearest_in_direction(self, point: Float64[np.ndarray, "2"], heading: float) -> int:
-        """Token of the nearest node within reach that runs in a direction; `NO_DESTINATION` without such a node.
-
-        Args:
-            point: Position x and y, m, ego frame.
-            heading: Direction in rad; directions of nodes differ by less than 90 degrees.
-        """
-        distance = np.linalg.norm(self.position - point, axis=1)
-        is_aligned = self.direction @ np.array([np.cos(heading), np.sin(heading)]) > 0
-        nodes = np.flatnonzero((distance < MAX_LANE_DISTANCE_M) & is_aligned)
-        return int(self.token[nodes[distance[nodes].argmin()]]) if len(nodes) else NO_DESTINATION
+BIKE_LANES, EDGES = (MapTokenType.BIKE_LANE,), (MapTokenType.EDGE_BOUNDARY,)
+NODE_TYPES = (VEHICLE_LANES, BIKE_LANES, EDGES)
+"""Types of map tokens whose nodes are looked for together."""
 
 
 class DestinationMap:
@@ -58,11 +33,13 @@ class DestinationMap:
     def __init__(self, map_tokens: MapTokens, successors: dict[int, list[int]]):
         self.map_tokens = map_tokens
         self.successors = successors
-        self.vehicle_lanes = Nodes(map_tokens, VEHICLE_LANES)
-        self.bike_lanes = Nodes(map_tokens, (MapTokenType.BIKE_LANE,))
-        self.edges = Nodes(map_tokens, (MapTokenType.EDGE_BOUNDARY,))
         is_lane = np.isin(map_tokens.type, VEHICLE_LANES)
         self.last_tokens = {int(id_): int(k) for k, id_ in enumerate(map_tokens.feature_id) if is_lane[k]}
+        nodes = {types: map_tokens.node_mask & np.isin(map_tokens.type, types)[:, None] for types in NODE_TYPES}
+        self.nodes = {
+            types: (np.nonzero(mask)[0], map_tokens.position[mask][:, :2], map_tokens.direction[mask][:, :2])
+            for types, mask in nodes.items()
+        }
 
     def destinations(self, last: Float64[np.ndarray, "4"], agent_class: int) -> dict[int, float]:
         """Tokens that an agent may be heading for, with probabilities; empty if there are none.
@@ -71,17 +48,29 @@ class DestinationMap:
             last: Position x and y, heading and speed at the agent's last logged step, ego frame.
             agent_class: Class of the agent: 0 vehicle, 1 pedestrian, 2 cyclist.
         """
-        heading, speed = last[2:]
-        position = last[:2]
+        position, heading, speed = last[:2], last[2], last[3]
         predicted_position = position + LOOKAHEAD_S * speed * np.array([np.cos(heading), np.sin(heading)])
+        token = NO_DESTINATION
         if agent_class == VEHICLE:
-            token = self.vehicle_lanes.nearest_in_direction(position, heading)
+            token = self._find_nearest(VEHICLE_LANES, position, heading)
             if token != NO_DESTINATION:
                 return self._walk_lanes(int(self.map_tokens.feature_id[token]), 1)
-        is_cyclist = agent_class == CYCLIST
-        token = self.bike_lanes.nearest_in_direction(predicted_position, heading) if is_cyclist else NO_DESTINATION
-        token = self.edges.nearest(predicted_position) if token == NO_DESTINATION else token
+        elif agent_class == CYCLIST:
+            token = self._find_nearest(BIKE_LANES, predicted_position, heading)
+        token = self._find_nearest(EDGES, predicted_position) if token == NO_DESTINATION else token
         return {} if token == NO_DESTINATION else {token: 1.0}
+
+    def _find_nearest(
+        self, types: tuple[int, ...], point: Float64[np.ndarray, "2"], heading: float | None = None
+    ) -> int:
+        """Token of the nearest node of some types, with a heading only of those within reach that run in its direction
+        (less than 90 degrees apart); `NO_DESTINATION` without such a node."""
+        token, position, direction = self.nodes[types]
+        distance = np.linalg.norm(position - point, axis=1)
+        if heading is not None:
+            is_aligned = direction @ np.array([np.cos(heading), np.sin(heading)]) > 0
+            distance = np.where((distance < MAX_LANE_DISTANCE_M) & is_aligned, distance, np.inf)
+        return int(token[distance.argmin()]) if np.isfinite(distance).any() else NO_DESTINATION
 
     def _walk_lanes(self, lane: int, depth: int) -> dict[int, float]:
         """Last tokens of the lanes that a walk from a lane may end on, with probabilities, each fork at random."""

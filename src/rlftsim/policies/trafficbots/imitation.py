@@ -121,7 +121,7 @@ def compute_scene_loss(
 
     Args:
         network: Network with the weights to be trained.
-        config: Settings with `free_nats` and `steps_per_pass`.
+        config: Settings with `free_nats`.
         scene: Scene with all 91 steps of the log.
         destination: Label of each agent, a map token; negative = none.
         trained: True = the agent counts; other agents are context.
@@ -136,14 +136,12 @@ def compute_scene_loss(
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
     conditioning = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
-    context = network.agents.context(map_features, light_features[:, CURRENT_STEP:])
+    context = network.agents.context(scene, map_features, light_features[:, CURRENT_STEP:])
 
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
-    rollout = _roll_out(network, scene, context, conditioning, destination[:, None], draws.forced)
+    rollout = _roll_out(network, context, conditioning, destination[:, None], draws.forced)
     value, grad = _differentiate_actions(scene, rollout, trained)
-    features = network.features_over_time(
-        rollout.history, rollout.active, scene, context, conditioning, steps_per_pass=config.steps_per_pass
-    )  # [B, T, 1, A, D]
+    features = network.features_over_time(rollout.history, rollout.active, context, conditioning)  # [B, T, 1, A, D]
     actions = network.mean_actions(features, scene).movedim(1, 3)  # [B, 1, A, T, 2]
     surrogate = (actions * grad).sum()
 
@@ -211,18 +209,17 @@ class _Rollout:
 @torch.no_grad()
 def _roll_out(
     network: TrafficBotsNetwork,
-    scene: Scene,
     context: AgentContext,
     conditioning: AgentConditioning,
     destination: Int64[Tensor, "B 1 A"],
     forced: Bool[Tensor, "B A"],
 ) -> _Rollout:
-    traffic = start_traffic(scene, destination)
+    scene, traffic = context.scene, start_traffic(context.scene, destination)
     states, actions, imposed_masks = [], [], []
     for index in range(FUTURE_STEPS):
         states.append(traffic)
         windows, lights = traffic.windows.add_decision_axis(), context.select_steps(slice(index, index + 1))
-        features = network.features(windows, scene, lights, conditioning, traffic.active[:, None])  # [B, 1, 1, A, D]
+        features = network.features(windows, lights, conditioning, traffic.active[:, None])  # [B, 1, 1, A, D]
         action = network.mean_actions(features, scene)[:, 0]
         step = CURRENT_STEP + index + 1
         logged = scene.valid[:, None, :, step]

@@ -6,7 +6,7 @@ Shapes: B scenarios, T decisions, N rollouts, A agents, W steps of a window, M m
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
 from typing import cast
@@ -260,8 +260,9 @@ def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
 
 @dataclass(frozen=True, eq=False)
 class AgentContext:
-    """Map and lights as keys and values of an agent encoder, by layer."""
+    """Scene of agents, with map and lights as keys and values of an agent encoder, by layer."""
 
+    scene: Scene
     map_tokens: tuple[KeyValues, ...]
     """Keys and values [B, H, M, d]."""
     light_tokens: tuple[KeyValues, ...]
@@ -269,7 +270,7 @@ class AgentContext:
 
     def select_steps(self, steps: slice) -> "AgentContext":
         """The same context with the lights of a range of decisions."""
-        return AgentContext(self.map_tokens, tuple(lights.select_steps(steps) for lights in self.light_tokens))
+        return replace(self, light_tokens=tuple(lights.select_steps(steps) for lights in self.light_tokens))
 
 
 class AgentEncoder(nn.Module):
@@ -283,26 +284,28 @@ class AgentEncoder(nn.Module):
             DecoderLayer(config.dim, config.num_heads, dropout) for _ in range(config.num_agent_layers)
         )
 
-    def context(self, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]) -> AgentContext:
+    def context(
+        self, scene: Scene, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]
+    ) -> AgentContext:
         """Keys and values of map and lights for each layer, computed once for all rollouts.
 
         Args:
+            scene: Scene with poses of map and lights, sizes and classes of agents.
             map_features: Features of the map tokens, from `MapEncoder`.
             light_features: Features of the lights at T decisions, from `LightEncoder`.
         """
         layers = decoder_layers(self.layers)
         map_tokens, light_tokens = ([layer.project(f) for layer in layers] for f in (map_features, light_features))
-        return AgentContext(tuple(map_tokens), tuple(light_tokens))
+        return AgentContext(scene, tuple(map_tokens), tuple(light_tokens))
 
-    def forward(self, windows: Windows, scene: Scene, context: AgentContext) -> Float[Tensor, "B T N A D"]:
+    def forward(self, windows: Windows, context: AgentContext) -> Float[Tensor, "B T N A D"]:
         """Features of all agents at T decisions of N rollouts, 0 for agents without a valid step in the window.
 
         Args:
             windows: Windows [B, T, N, A, W] of the agents.
-            scene: Scene with poses of map and lights, sizes and classes of agents.
             context: Result of `context` for the same T decisions.
         """
-        config, mask, pose = self.config, windows.token_mask, windows.token_pose
+        config, scene, mask, pose = self.config, context.scene, windows.token_mask, windows.token_pose
         num_decisions = mask.shape[1]
         find = partial(find_neighbors, pose, radius_m=config.radius_m, size=config.dim)
         map_neighbors = find(scene.map_pose, scene.map_mask, count=config.agent_map_neighbors)
@@ -446,8 +449,8 @@ class Posterior(nn.Module):
             map_features: Features from `MapEncoder`; receive gradient from agents, none from lights.
         """
         lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
-        context = self.agents.context(map_features, lights)
-        return at_least_float32(self.mean(self.agents(windows, scene, context)[:, 0, 0]))
+        context = self.agents.context(scene, map_features, lights)
+        return at_least_float32(self.mean(self.agents(windows, context)[:, 0, 0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,7 +468,7 @@ class TrafficBotsNetwork(nn.Module):
 
     def __init__(self, config: TrafficBotsConfig):
         super().__init__()
-        dim = config.dim
+        self.config, dim = config, config.dim
         self.map = MapEncoder(config)
         self.lights = LightEncoder(config, WINDOW)
         self.light_state = mlp(dim, dim, dim, NUM_LIGHT_STATES)
@@ -506,57 +509,43 @@ class TrafficBotsNetwork(nn.Module):
         return logits.clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
 
     def features(
-        self,
-        windows: Windows,
-        scene: Scene,
-        context: AgentContext,
-        conditioning: AgentConditioning,
-        active: Bool[Tensor, "B T N A"],
+        self, windows: Windows, context: AgentContext, conditioning: AgentConditioning, active: Bool[Tensor, "B T N A"]
     ) -> Float[Tensor, "B T N A D"]:
         """Features of agents that `mean_actions` decides by.
 
         Args:
             windows: Windows [B, T, N, A, 11] of the agents.
-            scene: Scene with map, lights, sizes and classes.
-            context: Map, and lights at the same T decisions.
+            context: Scene with the map, and lights at the same T decisions.
             conditioning: Personality and destination of each agent.
             active: True = the agent has not reached the destination yet.
         """
-        x = self.agents(windows, scene, context)
+        x = self.agents(windows, context)
         relative = relative_pose(conditioning.destination_pose[:, None], windows.pose[..., -1, :])  # [B, T, N, A, 3]
         pose = self.destination_pose(pose_embedding(relative, x.shape[-1]))
         x = self.add_destination(x, conditioning.destination_feature[:, None] + pose, active)
         return self.add_personality(x, conditioning.personality[:, None])
 
     def features_over_time(
-        self,
-        history: Windows,
-        active: Bool[Tensor, "B N A T"],
-        scene: Scene,
-        context: AgentContext,
-        conditioning: AgentConditioning,
-        *,
-        steps_per_pass: int,
+        self, history: Windows, active: Bool[Tensor, "B N A T"], context: AgentContext, conditioning: AgentConditioning
     ) -> Float[Tensor, "B T N A D"]:
-        """`features` at all decisions of finished rollouts, in a few parallel passes; differentiable.
+        """`features` at all decisions of finished rollouts, in passes of `steps_per_pass`; differentiable.
 
         The network has no state: a decision depends on the last 11 steps alone.
 
         Args:
             history: Agents [B, N, A, W - 1 + T] from the first step of the first decision's window on.
             active: True = the agent has not reached the destination yet at this decision.
-            scene: Scene with map, lights, sizes and classes.
-            context: Map, and lights at the same T decisions.
+            context: Scene with the map, and lights at the same T decisions.
             conditioning: Personality and destination of each agent.
-            steps_per_pass: Number of decisions in memory at once with gradient; changes memory and time only.
         """
         # [B, N, A, T, ..., W] -> [B, T, N, A, W, ...]
         windows = history.apply(lambda v: v.unfold(3, WINDOW, 1).movedim(3, 1).movedim(-1, 4))
-        passes = [slice(start, start + steps_per_pass) for start in range(0, active.shape[-1], steps_per_pass)]
+        size = self.config.steps_per_pass
+        passes = [slice(start, start + size) for start in range(0, active.shape[-1], size)]
         features = []
         for steps in passes:
             selected = windows.apply(lambda v, steps=steps: v[:, steps])
-            inputs = (selected, scene, context.select_steps(steps), conditioning, active.movedim(3, 1)[:, steps])
+            inputs = (selected, context.select_steps(steps), conditioning, active.movedim(3, 1)[:, steps])
             if torch.is_grad_enabled() and len(passes) > 1:
                 # Each pass is computed again in the backward pass, so that memory holds a single pass.
                 result = checkpoint(self.features, *inputs, use_reentrant=False, preserve_rng_state=False)

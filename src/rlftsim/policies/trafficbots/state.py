@@ -114,10 +114,8 @@ class Record:
         """Features at T decisions; None unless the states are those of the record."""
         if self.draws is None or len(self.poses) != len(states) or not torch.equal(self.draws, states[0].draws):
             return None
-        for pose, state in zip(self.poses, states):
-            if not torch.equal(pose, state.traffic.windows.pose[..., -1, :]):
-                return None
-        return torch.cat(self.features, 1)
+        poses = [state.traffic.windows.pose[..., -1, :] for state in states]
+        return torch.cat(self.features, 1) if all(map(torch.equal, self.poses, poses)) else None
 
 
 @dataclass(frozen=True, eq=False)
