@@ -16,8 +16,7 @@ import tiny
 from pretend_device import DEVICE, PretendDevice
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig
-from rlftsim.goals.logged import logged_goals
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, logged_goals
 from rlftsim.policies.smart.config import smart_demo, smart_tiny
 from rlftsim.realism import score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts

@@ -286,17 +286,12 @@ def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], 
     """
     problems = [f"missing {k}" for k in sorted(expected.keys() - weights.keys())]
     problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - expected.keys())]
-    pairs = [(k, weights[k], expected[k]) for k in sorted(expected.keys() & weights.keys())]
-    problems += [
-        f"{k} has shape {tuple(weight.shape)} instead of {tuple(model.shape)}"
-        for k, weight, model in pairs
-        if weight.shape != model.shape
-    ]
-    problems += [
-        f"{k} holds {weight.dtype} instead of {model.dtype}"
-        for k, weight, model in pairs
-        if weight.dtype != model.dtype and not {weight.dtype, model.dtype} <= _FLOATS
-    ]
+    for k in sorted(expected.keys() & weights.keys()):
+        (shape, dtype), (model_shape, model_dtype) = ((w[k].shape, w[k].dtype) for w in (weights, expected))
+        if shape != model_shape:
+            problems.append(f"{k} has shape {tuple(shape)} instead of {tuple(model_shape)}")
+        if dtype != model_dtype and not {dtype, model_dtype} <= _FLOATS:
+            problems.append(f"{k} holds {dtype} instead of {model_dtype}")
     if problems:
         text = printable(_join_first(problems, "; "))
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {text}.")

@@ -86,7 +86,8 @@ def _logits(
 
 
 class _RowStatistics(torch.autograd.Function):
-    """Statistics block by block, and their gradients by the logits, which are
+    """Statistics block by block, of hidden features, weight, offset, class and token of rows; and hidden features,
+    weight and offset of a reference if there is one. Their gradients by the logits are
 
     * 1[token] - p of the log-probability,
     * p (log p - log q - KL) of KL = sum p (log p - log q), where q are the probabilities of the reference,
@@ -128,24 +129,16 @@ class _RowStatistics(torch.autograd.Function):
         return by_hidden, by_weight, by_offset, *[None] * (len(inputs) - 3)
 
 
-def _blocks(
-    hidden: Float[Tensor, "R D"],
-    weight: Float[Tensor, "V D"],
-    offset: Float[Tensor, "C V"],
-    class_id: Int64[Tensor, "R"],
-    token: Int64[Tensor, "R"],
-    *reference: Tensor,
-) -> Iterator[tuple[slice, Float[Tensor, "r V"], Float[Tensor, "r V"]]]:
-    """Log-probabilities of policy and reference, a block of rows at a time."""
+def _blocks(*inputs: Tensor) -> Iterator[tuple[slice, Float[Tensor, "r V"], Float[Tensor, "r V"]]]:
+    """Log-probabilities of policy and reference, a block of rows at a time, from the inputs of `_RowStatistics`."""
+    hidden, weight, offset, class_id, _, *reference = inputs
     size = ROWS_PER_BLOCK.get(hidden.device.type, ROWS_PER_DEVICE_BLOCK)
     for start in range(0, len(hidden), size):
         rows = slice(start, start + size)
-        log_p = _logits(hidden[rows], weight, offset, class_id[rows]).log_softmax(-1)
-        if not reference:
-            yield rows, log_p, log_p
-            continue
-        ref_hidden, ref_weight, ref_offset = reference
-        yield rows, log_p, _logits(ref_hidden[rows], ref_weight, ref_offset, class_id[rows]).log_softmax(-1)
+        log_p = log_q = _logits(hidden[rows], weight, offset, class_id[rows]).log_softmax(-1)
+        if reference:
+            log_q = _logits(reference[0][rows], *reference[1:], class_id[rows]).log_softmax(-1)
+        yield rows, log_p, log_q
 
 
 class CategoricalDistribution:

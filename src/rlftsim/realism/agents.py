@@ -17,6 +17,9 @@ from torch import Tensor
 from rlftsim.errors import DataError
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, ObjectType, Scenario
 
+NUM_HISTORY_STEPS = 2
+"""Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedStates:
@@ -276,13 +279,12 @@ def match_agents(
     return order[np.searchsorted(rollout_ids[order], logged_ids)]
 
 
-def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, scenario_id: str) -> Trajectories:
-    """Rollouts in track order with logged history in front: [N, A, history_steps + 80].
+def join_history(agents: LoggedAgents, states: SimulatedStates, scenario_id: str) -> Trajectories:
+    """Rollouts in track order with two steps of logged history in front: [N, A, 82].
 
     Args:
         agents: Agents of the scenario as logged, whose order the result has.
         states: N rollouts of exactly these agents, in any order.
-        history_steps: Number of logged steps in front; the last of them is the current step.
         scenario_id: Scenario that messages name.
 
     Raises:
@@ -292,7 +294,7 @@ def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: i
     # Rollouts of our own policies come in track order already: no copy then.
     is_ordered = bool((order == np.arange(len(order))).all())
     index = None if is_ordered else torch.from_numpy(order).to(states.device)
-    first = CURRENT_STEP + 1 - history_steps
+    first = CURRENT_STEP + 1 - NUM_HISTORY_STEPS
 
     def prepend(log: Tensor, future: Tensor) -> Tensor:
         future = future if index is None else future.index_select(1, index)

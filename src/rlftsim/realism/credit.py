@@ -89,7 +89,7 @@ def compute_credit(log: AnyLog, features: Features, config: MetricConfig = METRI
     """
     num_distinct = _validate_num_distinct(features)
     # [1 + N, F, E]: of all rollouts, and of all but each
-    terms = _log_likelihood_terms(log, features, config, slice(0, 1 + num_distinct))
+    terms = _compute_terms(log, features, config, slice(0, 1 + num_distinct))
     added = split_difference(terms[:1], terms[1:], config, log.agents.layout)  # [N, F, E]
     return Credit(added.transpose(1, 2), features.repeat)
 
@@ -111,7 +111,7 @@ def compute_single_credit(
     """
     num_distinct = _validate_num_distinct(features)
     # [N, F, E]: of each rollout alone
-    terms = _log_likelihood_terms(log, features, config, slice(1 + num_distinct, None))
+    terms = _compute_terms(log, features, config, slice(1 + num_distinct, None))
     differences = split_difference(terms[:, None], terms[None], config, log.agents.layout)  # [N, N, F, E]
     # Pairs of equal rollouts add nothing, so the mean over all others is the sum over distinct ones times their repeat.
     return (differences.sum(1) * (features.repeat / (num_distinct * features.repeat - 1))).transpose(1, 2)
@@ -125,9 +125,7 @@ def _validate_num_distinct(features: Features) -> int:
     return num_distinct
 
 
-def _log_likelihood_terms(
-    log: AnyLog, features: Features, config: MetricConfig, sets: slice
-) -> Float64[Tensor, "S F E"]:
+def _compute_terms(log: AnyLog, features: Features, config: MetricConfig, sets: slice) -> Float64[Tensor, "S F E"]:
     """Terms of the agents in each feature's mean log-probability, under the selected sets of `form_sets`, nats."""
     target, table = log_target(log, config), histogram_table(config, features.linear_speed.device)
     counts, size = form_sets(count_rollouts(features, log, config), features.repeat)

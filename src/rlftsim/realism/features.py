@@ -37,8 +37,6 @@ from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Sc
 
 MissingMap = Literal["error", "neutral"]
 
-NUM_HISTORY_STEPS = 2
-"""Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
 INVALID_ROAD_EDGE_M = -1e10
 """Distance to the road edge of invalid agents, as officially; also of all agents in a scenario without road edges."""
 CACHED_LOGS = 64
@@ -223,7 +221,7 @@ def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap
     # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.
     log = Trajectories(*(values[None] for values in agents.trajectories))
     with torch.no_grad():
-        features = _measure_trajectories(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
+        features = _measure(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
     return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
 
 
@@ -242,19 +240,14 @@ def compute_features(
         DataError: The agents of the rollouts are not the scenario's simulated agents.
     """
     states = [states] if isinstance(states, SimulatedStates) else states
-    histories = [
-        join_history(scene.agents, rollouts, NUM_HISTORY_STEPS, scene.scenario_id)
-        for scene, rollouts in zip(log.logs, states)
-    ]
+    histories = [join_history(scene.agents, s, scene.scenario_id) for scene, s in zip(log.logs, states)]
     trajectories = histories[0] if len(histories) == 1 else join_trajectories(histories)  # [N, A, 82]
     max_pairs = compute.pairs_on(states[0].device)
-    features = _measure_trajectories(
-        trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs
-    )
+    features = _measure(trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
     return replace(features, repeat=states[0].repeat)
 
 
-def _measure_trajectories(
+def _measure(
     trajectories: Trajectories,
     agents: LoggedAgents,
     road_edges: RoadEdges | None,

@@ -267,9 +267,7 @@ def compute_batch_features(
     if can_join and states[0].device.type != "cpu":
         joined_logs = JoinedLogs.from_logs(logs)
         return (ScenarioFeatures(joined_logs, compute_features(joined_logs, states, compute=compute)),)
-    return tuple(
-        ScenarioFeatures(log, compute_features(log, rollouts, compute=compute)) for log, rollouts in zip(logs, states)
-    )
+    return tuple(ScenarioFeatures(log, compute_features(log, s, compute=compute)) for log, s in zip(logs, states))
 
 
 def score_batch_features(features: Sequence[ScenarioFeatures], config: MetricConfig = METRIC_2025) -> RealismResult:

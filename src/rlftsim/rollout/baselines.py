@@ -66,21 +66,12 @@ def check_no_top_k(sampling: Sampling) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class ConstantVelocityContext:
-    """State of every agent at the current step, map frame."""
-
-    position: Float[Tensor, "B A 2"]
-    heading: Float[Tensor, "B A"]
-    velocity: Float[Tensor, "B A 2"]
-
-
-@dataclass(frozen=True, eq=False)
 class ConstantVelocityState:
-    """Poses and velocities of running simulations, map frame."""
+    """Poses and velocities of running simulations [B, N, A], map frame; as a context at the current step [B, A]."""
 
-    position: Float[Tensor, "B N A 2"]
-    heading: Float[Tensor, "B N A"]
-    velocity: Float[Tensor, "B N A 2"]
+    position: Float[Tensor, "*batch 2"]
+    heading: Float[Tensor, "*batch"]
+    velocity: Float[Tensor, "*batch 2"]
     poses: Float[Tensor, "B N A 1 3"] | None = None
     draws: Tensor | None = None
 
@@ -100,13 +91,13 @@ class ConstantVelocity:
     def __repr__(self) -> str:
         return "ConstantVelocity()"
 
-    def encode(self, scenarios: ScenarioBatch) -> ConstantVelocityContext:
+    def encode(self, scenarios: ScenarioBatch) -> ConstantVelocityState:
         """States at the current step."""
         states = (scenarios.position, scenarios.heading, scenarios.velocity)
-        return ConstantVelocityContext(*(values[:, :, CURRENT_STEP] for values in states))
+        return ConstantVelocityState(*(values[:, :, CURRENT_STEP] for values in states))
 
     def begin(
-        self, context: ConstantVelocityContext, num_rollouts: int, goals: Goals | None, noise: Tensor
+        self, context: ConstantVelocityState, num_rollouts: int, goals: Goals | None, noise: Tensor
     ) -> ConstantVelocityState:
         """The current state, N times.
 
@@ -119,7 +110,7 @@ class ConstantVelocity:
         states = (context.position, context.heading, context.velocity)
         return ConstantVelocityState(*(v[:, None].expand(-1, num_rollouts, *v.shape[1:]) for v in states))
 
-    def decide(self, context: ConstantVelocityContext, state: ConstantVelocityState) -> PointMass:
+    def decide(self, context: ConstantVelocityState, state: ConstantVelocityState) -> PointMass:
         """Distributions [B, N, A] with all mass on the present velocity.
 
         Args:
@@ -130,7 +121,7 @@ class ConstantVelocity:
 
     def advance(
         self,
-        context: ConstantVelocityContext,
+        context: ConstantVelocityState,
         state: ConstantVelocityState,
         decision: Float[Tensor, "B N A 2"],
         forced: AgentStates | None = None,
@@ -151,7 +142,7 @@ class ConstantVelocity:
         poses = torch.cat([position, heading[..., None]], -1)[..., None, :]
         return ConstantVelocityState(position, heading, state.velocity, poses, state.draws)
 
-    def score(self, context: ConstantVelocityContext, rollouts: Rollouts) -> PointMass:
+    def score(self, context: ConstantVelocityState, rollouts: Rollouts) -> PointMass:
         """Distributions [B, N, A, L]: the same velocity at every decision.
 
         Args:

@@ -560,10 +560,8 @@ class Rules(_Subject):
                 with torch.no_grad():
                     context = frozen.encode(self.batch)
                     contexts = [encode_like(policy, self.batch, context) for policy in (frozen, reference)]
-                    dist, ref_dist = score_with_reference(
-                        frozen, contexts[0], rollouts, reference, contexts[1], rollouts
-                    )
-                    statistics = compute_statistics(dist, decision, ref_dist)
+                    dist, ref = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
+                    statistics = compute_statistics(dist, decision, ref)
                 kl = expected.kl(self.score(self.batch, rollouts, reference))
                 gaps += [
                     _compute_gap(statistics.log_prob, expected.log_prob(decision)),
@@ -626,6 +624,4 @@ class Rules(_Subject):
         return _check_worst(gaps, SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap")
 
 
-CHECKS: tuple[Callable[[Rules], str], ...] = tuple(
-    rule for name, rule in vars(Rules).items() if not name.startswith("_")
-)
+CHECKS = tuple(rule for name, rule in vars(Rules).items() if not name.startswith("_"))

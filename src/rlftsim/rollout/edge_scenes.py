@@ -38,12 +38,10 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
 
     heading = wrapped(scenario.tracks.heading.astype(np.float64) + turn_rad).astype(np.float32)
     velocity = (scenario.tracks.velocity.astype(np.float64) @ matrix[:2, :2].T).astype(np.float32)
-    return _transform_points(scenario, moved, heading=heading, velocity=velocity)
+    return _move_points(scenario, moved, heading=heading, velocity=velocity)
 
 
-def _transform_points(
-    scenario: Scenario, transform: Callable[[np.ndarray], np.ndarray], **tracks: np.ndarray
-) -> Scenario:
+def _move_points(scenario: Scenario, transform: Callable[[np.ndarray], np.ndarray], **tracks: np.ndarray) -> Scenario:
     """The scenario with all points transformed, and further fields of the tracks replaced."""
     features, lights = scenario.map_features, scenario.lights
     return replace(
@@ -79,7 +77,7 @@ def place_on_grid(scenario: Scenario) -> Scenario:
     def rounded(points: np.ndarray) -> np.ndarray:
         return (np.round(points / GRID_M) * GRID_M).astype(np.float32)
 
-    return _transform_points(central, rounded)
+    return _move_points(central, rounded)
 
 
 def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:

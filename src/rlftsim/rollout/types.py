@@ -36,13 +36,11 @@ class AgentStates:
             start: First step of 0.1 s, counted from 0 at the first simulated step.
             stop: Step after the last, on the same count.
         """
-        return AgentStates(
-            self.position[..., start:stop, :], self.heading[..., start:stop], self.valid[..., start:stop]
-        )
+        return AgentStates(*(values[:, :, :, start:stop] for values in vars(self).values()))
 
     def rollouts(self, selected: slice) -> "AgentStates":
         """The states of some of the rollouts."""
-        return AgentStates(self.position[:, selected], self.heading[:, selected], self.valid[:, selected])
+        return AgentStates(*(values[:, selected] for values in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

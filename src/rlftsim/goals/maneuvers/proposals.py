@@ -17,18 +17,21 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.goals.maneuvers.lane_paths import (
+    LONGEST_UTURN_M,
     MAX_LANE_DISTANCE_M,
     LanePath,
     Lanes,
     Pose,
+    change_length_m,
     ease_m,
+    lane_change_paths,
     lanes_for,
     own_lanes,
     paths_from,
     shorten_path,
+    uturn_paths,
 )
 from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S, Reach, compute_reach
-from rlftsim.goals.maneuvers.side_paths import LONGEST_UTURN_M, change_length_m, lane_change_paths, uturn_paths
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, STRAIGHT_RAD, Maneuver, classify_turn

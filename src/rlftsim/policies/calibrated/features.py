@@ -56,9 +56,7 @@ class Feature:
         return values.clamp(self.low, self.high)
 
 
-FEATURES: ExtensionPoint[Feature] = ExtensionPoint(
-    "feature", "rlftsim.features", use=lambda name: features_by_name([name])
-)
+FEATURES = ExtensionPoint[Feature]("feature", "rlftsim.features", use=lambda name: features_by_name([name]))
 """Features by name, this package's and others'."""
 
 

@@ -160,11 +160,10 @@ class CalibratedPolicy(nn.Module):
         self.base: Any = base
         self.features = tuple(features)
         self._features = features_by_name(self.features)
-        values = torch.zeros(len(self.features)) if eta is None else torch.tensor(eta, dtype=torch.float32)
-        if values.shape != (len(self.features),):
-            raise ConfigError(
-                f"eta has {len(values)} weights for {len(self.features)} features: it needs one for each."
-            )
+        count = len(self.features)
+        values = torch.zeros(count) if eta is None else torch.tensor(eta, dtype=torch.float32)
+        if values.shape != (count,):
+            raise ConfigError(f"eta has {len(values)} weights for {count} features: it needs one for each.")
         # A parameter, so that runs can be averaged; never trained by a gradient of the complete model.
         self.eta = nn.Parameter(values, requires_grad=False)
         self._calibration = dict(calibration or {})
@@ -224,7 +223,7 @@ class CalibratedPolicy(nn.Module):
             context: Result of `encode` for the scenarios.
             state: State before the decision.
         """
-        return self._tilt(context, self.base.decide(context.base, state.base), state.traffic)
+        return self._tilt(context.scene, self.base.decide(context.base, state.base), state.traffic)
 
     def advance(
         self, context: CalibratedContext, state: CalibratedState, decision: Tensor, forced: AgentStates | None = None
@@ -254,7 +253,7 @@ class CalibratedPolicy(nn.Module):
         path = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)  # [B, N, A, T, 3]
         for poses in path.split(self.steps_per_decision, 3)[:-1]:
             moments.append(moments[-1].advance(poses, self._seconds))
-        return self._tilt(context, scored, join_moments(moments))
+        return self._tilt(context.scene, scored, join_moments(moments))
 
     # ---- variants of the base -------------------------------------------------------------------------------------
 
@@ -328,7 +327,5 @@ class CalibratedPolicy(nn.Module):
         """Duration of a decision."""
         return self.steps_per_decision * STEP_S
 
-    def _tilt(self, context: CalibratedContext, dist: Any, traffic: Traffic) -> TiltedDistribution:
-        return TiltedDistribution(
-            dist, self.eta, self._features, context.scene, traffic, self.vocabulary, self._seconds
-        )
+    def _tilt(self, scene: Scene, dist: Any, traffic: Traffic) -> TiltedDistribution:
+        return TiltedDistribution(dist, self.eta, self._features, scene, traffic, self.vocabulary, self._seconds)

@@ -308,14 +308,8 @@ class _GatherEdges(Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        neighborhoods: Neighborhoods,
-        dropout: float,
-        token: Tensor | None,
-        source: Tensor | None,
-        *queries: Tensor,
-    ) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, neighborhoods: Neighborhoods, dropout: float, *tensors: Any) -> tuple[Tensor, ...]:
+        _, source, *queries = tensors  # the token, for its gradient, then tensors or None
         sums = [query.new_empty(query.shape) for query in queries]
         total = queries[0].new_empty(*queries[0].shape[:2], 1)
         saved, sizes = [], neighborhoods.sizes

@@ -9,7 +9,6 @@ refused.
 """
 
 import collections
-import typing
 import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -35,20 +34,9 @@ from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.tokens.vocabulary import MAX_TOKENS, STEPS_PER_TOKEN
 
-_FOREIGN = (
-    "omegaconf.dictconfig.DictConfig",
-    "omegaconf.listconfig.ListConfig",
-    "omegaconf.nodes.AnyNode",
-    "omegaconf.base.ContainerMetadata",
-    "omegaconf.base.Metadata",
-)
-_HARMLESS = {
-    "typing.Any": typing.Any,
-    "collections.defaultdict": collections.defaultdict,
-    "builtins.list": list,
-    "builtins.dict": dict,
-    "builtins.int": int,
-}
+_OMEGACONF = "dictconfig.DictConfig listconfig.ListConfig nodes.AnyNode base.ContainerMetadata base.Metadata"
+"""Foreign classes, for which there is a stand-in."""
+_HARMLESS = (Any, collections.defaultdict, list, dict, int)
 PREFIX = "encoder."
 _PLAIN, _MLP, _FOURIER, _ATTENTION = "plain", "mlp", "fourier", "attention"
 _SUBMODULES = (
@@ -159,12 +147,13 @@ def _unpickle(path: Path) -> Any:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
                 raise CheckpointError(f"{path}: packed, which torch.save never does: unpack it, or get the file again.")
         # list the classes that the pickle names before any is made
+        classes: Any = [(_Inert, f"omegaconf.{name}") for name in _OMEGACONF.split()]
+        classes += [(value, f"{value.__module__}.{value.__name__}") for value in _HARMLESS]
         named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
-        refused = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
+        refused = sorted(set(named) - {name for _, name in classes})
         if refused:
             raise CheckpointError(f"{path}: refused, it holds {', '.join(refused)}: save it again with weights only.")
         # then let torch's restricted unpickler make the harmless classes, and stand-ins for the foreign
-        classes: Any = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
         with torch.serialization.safe_globals(classes):
             return torch.load(path, map_location="cpu", weights_only=True)
     except CheckpointError:
@@ -270,15 +259,9 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
     lacking = "has no form in the public CAT-K code"
     if policy.is_goal_conditioned:
         raise CheckpointError(f"a goal-conditioned model {lacking}: export the one it came from.")
-    if policy.config.head_per_class:
-        raise CheckpointError(
-            f"a model with head_per_class {lacking}, which has one head for all classes: "
-            "train one with model.head_per_class=false."
-        )
-    if policy.config.continuation_scores:
-        raise CheckpointError(
-            f"a model with continuation_scores {lacking}: train one with model.continuation_scores=false."
-        )
+    for setting, reason in (("head_per_class", ", which has one head for all classes"), ("continuation_scores", "")):
+        if getattr(policy.config, setting):
+            raise CheckpointError(f"a model with {setting} {lacking}{reason}: train one with model.{setting}=false.")
     named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
     return named | {second: named[first].clone() for second, first in find_aliases(named).items()}
 

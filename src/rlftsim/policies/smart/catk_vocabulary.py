@@ -102,9 +102,8 @@ def _check_tables(tables: dict[str, np.ndarray], source: str) -> None:
         for name, shape in shapes.items()
         if tables[name].shape[1:] != shape[1:] or tables[name].ndim != len(shape)
     ]
-    problems += [
-        f"{name} holds {tables[name].dtype}, not numbers" for name in shapes if tables[name].dtype.kind not in "fiu"
-    ]
+    types = {name: tables[name].dtype for name in shapes}
+    problems += [f"{name} holds {dtype}, not numbers" for name, dtype in types.items() if dtype.kind not in "fiu"]
     if not problems:
         counts = {len(tables[name]) for name in MOTION_TABLES}
         if not 1 <= min(counts) <= max(counts) <= MAX_TOKENS:

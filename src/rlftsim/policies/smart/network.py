@@ -364,7 +364,7 @@ class AgentDecoder(nn.Module):
             token that led to the step (E = D + F); and the past, followed by the block.
         """
         view = self.look(scene, steps, past) if view is None else view
-        x = self._embed_steps(scene, steps, view, goals)
+        x = self._embed(scene, steps, view, goals)
         goal_edges = self._build_goal_edges(scene, view, goals)
         # inputs of the attention over time are stored: later blocks attend to them
         sources, folded = [], itertools.repeat(None) if maps is None else iter(maps)
@@ -382,9 +382,7 @@ class AgentDecoder(nn.Module):
             x = torch.cat([x, scene.token_keys.last_phase[class_id, token_id]], -1)
         return x, replace(view.past, sources=tuple(sources))
 
-    def _embed_steps(
-        self, scene: Scene, steps: TokenSteps, view: View, goals: EncodedGoals | None
-    ) -> Float[Tensor, "R D"]:
+    def _embed(self, scene: Scene, steps: TokenSteps, view: View, goals: EncodedGoals | None) -> Float[Tensor, "R D"]:
         """Initial features: the token that led to a step, and motion, class, size and goal of the agent."""
         scenario, _, agent, _ = view.rows
         motion = steps.motion[view.rows]

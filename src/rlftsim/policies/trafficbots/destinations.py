@@ -52,17 +52,15 @@ class DestinationMap:
         predicted_position = position + LOOKAHEAD_S * speed * np.array([np.cos(heading), np.sin(heading)])
         token = NO_DESTINATION
         if agent_class == VEHICLE:
-            token = self._find_nearest(VEHICLE_LANES, position, heading)
+            token = self._find_node(VEHICLE_LANES, position, heading)
             if token != NO_DESTINATION:
                 return self._walk_lanes(int(self.map_tokens.feature_id[token]), 1)
         elif agent_class == CYCLIST:
-            token = self._find_nearest(BIKE_LANES, predicted_position, heading)
-        token = self._find_nearest(EDGES, predicted_position) if token == NO_DESTINATION else token
+            token = self._find_node(BIKE_LANES, predicted_position, heading)
+        token = self._find_node(EDGES, predicted_position) if token == NO_DESTINATION else token
         return {} if token == NO_DESTINATION else {token: 1.0}
 
-    def _find_nearest(
-        self, types: tuple[int, ...], point: Float64[np.ndarray, "2"], heading: float | None = None
-    ) -> int:
+    def _find_node(self, types: tuple[int, ...], point: Float64[np.ndarray, "2"], heading: float | None = None) -> int:
         """Token of the nearest node of some types, with a heading only of those within reach that run in its direction
         (less than 90 degrees apart); `NO_DESTINATION` without such a node."""
         token, position, direction = self.nodes[types]

@@ -234,9 +234,7 @@ def _find_relevant_positions(scenario: Scenario) -> Float64[np.ndarray, "n 3"]:
     return to_ego_frame(tracks.position[:, :HISTORY_STEPS][is_logged].astype(np.float64), ego_pose(scenario))
 
 
-def _select_tokens(
-    tokens: MapTokens, agents: Float64[np.ndarray, "n 3"], max_tokens: int | None
-) -> Int64[np.ndarray, "m"]:
+def _select_tokens(tokens: MapTokens, agents: Float64[np.ndarray, "n 3"], limit: int | None) -> Int64[np.ndarray, "m"]:
     """Indices of the tokens near agents."""
     # 1. Some node inside of the agents' bounding box, grown by the margins.
     low, high = agents.min(0), agents.max(0)
@@ -248,11 +246,11 @@ def _select_tokens(
         is_selected[:] = True
     # 2. Still too many: in file order, tokens with both ends beyond a radius that is halved again and again.
     radius = MAP_MARGIN_M
-    while max_tokens is not None and is_selected.sum() > max_tokens:
+    while limit is not None and is_selected.sum() > limit:
         last = tokens.node_mask.sum(1) - 1
         ends = np.stack([tokens.position[:, 0], tokens.position[np.arange(len(tokens)), last]], 1)  # [M, 2, 3]
         distance = np.linalg.norm(ends[:, :, None] - agents, axis=-1).min((1, 2))
         distant_tokens = np.flatnonzero(is_selected & (distance >= radius))
-        is_selected[distant_tokens[: is_selected.sum() - max_tokens]] = False
+        is_selected[distant_tokens[: is_selected.sum() - limit]] = False
         radius /= 2
     return np.flatnonzero(is_selected)

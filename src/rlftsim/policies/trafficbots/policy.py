@@ -69,7 +69,7 @@ class TrafficBotsPolicy(nn.Module):
 
     def encode(self, scenarios: ScenarioBatch) -> TrafficBotsContext:
         """Features of the map, and of the lights at all decisions."""
-        return self._encode_scene(build_scene(scenarios, HISTORY_STEPS, self.config.max_map_tokens))
+        return self.encode_scene(build_scene(scenarios, HISTORY_STEPS, self.config.max_map_tokens))
 
     def begin(
         self, context: TrafficBotsContext, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A 17"]
@@ -103,7 +103,8 @@ class TrafficBotsPolicy(nn.Module):
         """
         personality, destination = draws[..., :LATENT_SIZE], draws[..., LATENT_SIZE].long()
         conditioning = self.network.conditioning(context.scene, context.map_features, personality, destination)
-        return TrafficBotsState(start_traffic(context.scene, destination), conditioning, draws)
+        traffic = start_traffic(context.scene, destination)
+        return TrafficBotsState(traffic, conditioning, draws, continues=torch.zeros_like(traffic.alive))
 
     def decide(self, context: TrafficBotsContext, state: TrafficBotsState) -> GaussianDistribution:
         """Distributions [B, N, A] of the next action.
@@ -112,7 +113,8 @@ class TrafficBotsPolicy(nn.Module):
             context: Context of the scenarios, from `encode`, shared by all rollouts.
             state: State before the decision; the memo in it is filled.
         """
-        mean, residual = self._compute_mean(context, state), None
+        mean = self._compute_mean(context, state)
+        residual = torch.zeros_like(mean)
         if state.previous is not None and state.decision is not None:
             residual = state.decision - self._compute_mean(context, state.previous)
         return self._distribution(context, mean, residual, state.continues, state.traffic.alive)
@@ -163,7 +165,7 @@ class TrafficBotsPolicy(nn.Module):
             rollouts: Rollouts of the same scenarios, with decisions, forced states and draws.
         """
         replay = self._replay(context, rollouts)
-        return self._score_states(context, replay, rollouts.decision, self._compute_features(context, replay))
+        return self._score_states(context, replay, rollouts.decision, self._encode_agents(context, replay))
 
     def encode_like(self, scenarios: ScenarioBatch, context: Any) -> TrafficBotsContext:
         """`encode(scenarios)`, with map and lights taken over from a model with the same features of both.
@@ -199,9 +201,39 @@ class TrafficBotsPolicy(nn.Module):
         replay = self._replay(context, rollouts)
         with torch.no_grad():
             features = None if context.record is None else context.record.find_features(replay)
-            features = self._compute_features(context, replay) if features is None else features
+            features = self._encode_agents(context, replay) if features is None else features
             ref_dist = reference._score_states(ref_context, replay, rollouts.decision, features)
         return self._score_states(context, replay, rollouts.decision, features), ref_dist
+
+    def encode_scene(self, scene: Scene) -> TrafficBotsContext:
+        """Features of the map, and of the lights at all decisions.
+
+        Args:
+            scene: Scene of the batch; only the history is read.
+        """
+        map_features = self.network.map(scene, scene.node_mask)
+        light_features = self._roll_lights(scene, map_features)
+        agent_context = self.network.agents.context(scene, map_features, light_features)
+        trains_actions = any(weight.requires_grad for weight in self.network.actions.parameters())
+        record = Record() if trains_actions and self.shares_agent_features(self) else None
+        return TrafficBotsContext(scene, map_features, light_features, agent_context, self, record)
+
+    def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
+        """Features of the lights at all 80 decisions; each next state is the most likely state.
+
+        Lights do not see agents, so that the features are the same in all rollouts of a scene.
+        """
+        encoder = self.network.lights
+        neighborhoods = encoder.neighborhoods(scene, map_features)
+        window = scene.light_state[:, None, :, : encoder.window]  # [B, 1, L, W]
+        if not scene.light_mask.any():
+            return encoder(window, neighborhoods).expand(-1, FUTURE_STEPS, -1, -1)
+        features = []
+        for _ in range(FUTURE_STEPS):
+            features.append(encoder(window, neighborhoods))
+            state = self.network.next_light_logits(features[-1]).argmax(-1)
+            window = torch.cat([window[..., 1:], state[..., None]], -1)
+        return torch.cat(features, 1)
 
     # ---- training -----------------------------------------------------------------------------------------------
 
@@ -259,37 +291,7 @@ class TrafficBotsPolicy(nn.Module):
         """
         return imitation_loss(self.network, self.config, scenarios, trained, update)
 
-    # ---- scenes, states, means and distributions ---------------------------------------------------------------------
-
-    def _encode_scene(self, scene: Scene) -> TrafficBotsContext:
-        """Features of the map, and of the lights at all decisions.
-
-        Args:
-            scene: Scene of the batch; only the history is read.
-        """
-        map_features = self.network.map(scene, scene.node_mask)
-        light_features = self._roll_lights(scene, map_features)
-        agent_context = self.network.agents.context(scene, map_features, light_features)
-        trains_actions = any(weight.requires_grad for weight in self.network.actions.parameters())
-        record = Record() if trains_actions and self.shares_agent_features(self) else None
-        return TrafficBotsContext(scene, map_features, light_features, agent_context, self, record)
-
-    def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
-        """Features of the lights at all 80 decisions; each next state is the most likely state.
-
-        Lights do not see agents, so that the features are the same in all rollouts of a scene.
-        """
-        encoder = self.network.lights
-        neighborhoods = encoder.neighborhoods(scene, map_features)
-        window = scene.light_state[:, None, :, : encoder.window]  # [B, 1, L, W]
-        if not scene.light_mask.any():
-            return encoder(window, neighborhoods).expand(-1, FUTURE_STEPS, -1, -1)
-        features = []
-        for _ in range(FUTURE_STEPS):
-            features.append(encoder(window, neighborhoods))
-            state = self.network.next_light_logits(features[-1]).argmax(-1)
-            window = torch.cat([window[..., 1:], state[..., None]], -1)
-        return torch.cat(features, 1)
+    # ---- states, means and distributions -----------------------------------------------------------------------------
 
     def _replay(self, context: TrafficBotsContext, rollouts: Rollouts) -> list[TrafficBotsState]:
         """States before each of T decisions, without the network."""
@@ -302,9 +304,7 @@ class TrafficBotsPolicy(nn.Module):
                 states.append(self.advance(context, state, rollouts.decision[:, :, :, index], forced))
         return states
 
-    def _compute_features(
-        self, context: TrafficBotsContext, states: list[TrafficBotsState]
-    ) -> Float[Tensor, "B T N A D"]:
+    def _encode_agents(self, context: TrafficBotsContext, states: list[TrafficBotsState]) -> Float[Tensor, "B T N A D"]:
         """Features of agents in each of T states."""
         traffic = [state.traffic for state in states]
         return self.network.features_over_time(
@@ -323,8 +323,7 @@ class TrafficBotsPolicy(nn.Module):
         mean = self.network.mean_actions(features, context.scene).movedim(1, 3)  # [B, N, A, T, 2]
         alive = torch.stack([state.traffic.alive for state in states], 3)  # [B, N, A, T]
         residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), (decision - mean)[:, :, :, :-1]], 3)
-        continues = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
-        return self._distribution(context, mean, residual, torch.stack(continues, 3), alive)
+        return self._distribution(context, mean, residual, torch.stack([state.continues for state in states], 3), alive)
 
     def _compute_mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
         """Mean actions in a state, from the state's memo after the first call."""
@@ -342,18 +341,17 @@ class TrafficBotsPolicy(nn.Module):
         self,
         context: TrafficBotsContext,
         mean: Float[Tensor, "B N A *T 2"],
-        residual: Float[Tensor, "B N A *T 2"] | None,
-        continues: Bool[Tensor, "B N A *T"] | None,
+        residual: Float[Tensor, "B N A *T 2"],
+        continues: Bool[Tensor, "B N A *T"],
         alive: Bool[Tensor, "B N A *T"],
     ) -> GaussianDistribution:
         """Distributions around means; noise goes on from the residual of the decision before, where it continues."""
         agent_class = context.scene.agent_class
         shape = (len(agent_class), 1, agent_class.shape[1], *[1] * (mean.dim() - 4), 2)
         std = self.noise_std[agent_class].view(shape).expand_as(mean)
-        if residual is not None and continues is not None:
-            rho = self.config.noise_correlation
-            mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
-            std = torch.where(continues[..., None], std * math.sqrt(1 - rho**2), std)
+        rho = self.config.noise_correlation
+        mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
+        std = torch.where(continues[..., None], std * math.sqrt(1 - rho**2), std)
         return GaussianDistribution(mean, std, alive)
 
     # ---- files ----------------------------------------------------------------------------------------------------

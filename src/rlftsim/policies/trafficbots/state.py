@@ -248,6 +248,8 @@ class TrafficBotsState:
     conditioning: AgentConditioning
     draws: Float[Tensor, "B N A 17"]
     """Personality (16 numbers) and index of the destination, -1 where there is none."""
+    continues: Bool[Tensor, "B N A"]
+    """True = the agent moved as decided, so that the noise goes on from this decision; False before the first."""
     num_decisions: int = 0
     poses: Float[Tensor, "B N A 1 3"] | None = None
     """Poses in the frame of the batch."""
@@ -255,6 +257,4 @@ class TrafficBotsState:
     """State before the last decision: the noise of a decision depends on the noise of the decision before."""
     decision: Float[Tensor, "B N A 2"] | None = None
     """The last decision."""
-    continues: Bool[Tensor, "B N A"] | None = None
-    """True = the agent moved as decided, so that the noise goes on from this decision."""
     memo: Memo = field(default_factory=Memo, repr=False)
