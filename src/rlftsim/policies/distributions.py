@@ -75,13 +75,10 @@ def compute_row_statistics(
 
 
 def _logits(
-    hidden: Float[Tensor, "r D"],
-    weight: Float[Tensor, "V D"],
-    offset: Float[Tensor, "C V"],
-    class_id: Int64[Tensor, "r"],
+    hidden: Float[Tensor, "r D"], weight: Float[Tensor, "V D"], bias: Float[Tensor, "C V"], class_id: Int64[Tensor, "r"]
 ) -> Float[Tensor, "r V"]:
     """Logits of rows, at least float32 also where autocast multiplies in bfloat16."""
-    logits = torch.addmm(offset.index_select(0, class_id), hidden, weight.mT)
+    logits = torch.addmm(bias.index_select(0, class_id), hidden, weight.mT)
     return at_least_float32(logits)
 
 

@@ -21,18 +21,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from rlftsim.errors import DataError
+from rlftsim.realism import likelihood
 from rlftsim.realism.agents import Layout, sum_over_agents, to_agents
 from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
 from rlftsim.realism.features import AnyLog, Features
-from rlftsim.realism.likelihood import (
-    RolloutCounts,
-    compute_agent_log_likelihoods,
-    compute_outcomes,
-    count_rollouts,
-    count_terms,
-    histogram_table,
-    log_target,
-)
 from rlftsim.realism.meta_metric import ScenarioFeatures, form_sets
 
 
@@ -127,11 +119,11 @@ def _validate_num_distinct(features: Features) -> int:
 
 def _compute_terms(log: AnyLog, features: Features, config: MetricConfig, sets: slice) -> Float64[Tensor, "S F E"]:
     """Terms of the agents in each feature's mean log-probability, under the selected sets of `form_sets`, nats."""
-    target, table = log_target(log, config), histogram_table(config, features.linear_speed.device)
-    counts, size = form_sets(count_rollouts(features, log, config), features.repeat)
-    counts = RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
-    by_agent = compute_agent_log_likelihoods(counts, size[sets].double(), target, table)
-    return by_agent / to_agents(count_terms(target).double(), target.layout)
+    target, table = likelihood.log_target(log, config), likelihood.histogram_table(config, features.linear_speed.device)
+    counts, size = form_sets(likelihood.count_rollouts(features, log, config), features.repeat)
+    counts = likelihood.RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
+    by_agent = likelihood.compute_agent_log_likelihoods(counts, size[sets].double(), target, table)
+    return by_agent / to_agents(likelihood.count_terms(target).double(), target.layout)
 
 
 def split_difference(
@@ -187,12 +179,12 @@ class AgentScores:
     @cached_property
     def collision(self) -> Float[Tensor, "B N A"]:
         """Shares of `RealismResult.rollout_collision_rate`: 1 / E for each evaluated agent that collides."""
-        return self._scatter_mean(lambda scene: compute_outcomes(scene.features, scene.log)[:, 0].float())
+        return self._scatter_mean(lambda scene: likelihood.compute_outcomes(scene.features, scene.log)[:, 0].float())
 
     @cached_property
     def offroad(self) -> Float[Tensor, "B N A"]:
         """Shares of `RealismResult.rollout_offroad_rate`: 1 / E for each evaluated agent that leaves the road."""
-        return self._scatter_mean(lambda scene: compute_outcomes(scene.features, scene.log)[:, 1].float())
+        return self._scatter_mean(lambda scene: likelihood.compute_outcomes(scene.features, scene.log)[:, 1].float())
 
     def _scatter_mean(self, compute: Callable[[ScenarioFeatures], Tensor]) -> Tensor:
         """Values [N, E] over the number of evaluated agents in each scenario, scattered as by `_scatter`."""

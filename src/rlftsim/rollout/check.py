@@ -21,14 +21,7 @@ from torch import Tensor, nn
 from rlftsim.errors import RlftsimError, locate_error
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
-from rlftsim.rollout.edge_scenes import (
-    EXACT_TURN_RAD,
-    GRID_M,
-    edge_scenes,
-    move_scenario,
-    place_on_grid,
-    without_future,
-)
+from rlftsim.rollout import edge_scenes
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import (
     DecisionDistribution,
@@ -279,7 +272,7 @@ def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], A
         # constant speed along a chord of the arc
         offset = rotate(velocity[:, :, None] * time[:, None], (turn / 2).expand(*heading.shape, stride))
         # On the grid of `place_on_grid`, so that these poses can be turned without rounding.
-        path = ((position[:, :, None] + offset) / GRID_M).round() * GRID_M
+        path = ((position[:, :, None] + offset) / edge_scenes.GRID_M).round() * edge_scenes.GRID_M
         led = batch.agent_mask & ((index == 0) | ((index % 3 == 1) & (step < 20)))
         shape = (-1, NUM_ROLLOUTS, -1, stride)
         return AgentStates(
@@ -576,10 +569,11 @@ class Rules(_Subject):
         """Scenarios and rollouts turned and shifted together have the same scores."""
         gaps = {}
         # on a grid that stays exact under the turns below: gaps are then the policy's rounding
-        still = replace(self, scenarios=tuple(place_on_grid(s) for s in self.scenarios))
-        turns = (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 53.13 degrees", EXACT_TURN_RAD))
-        for name, turn in turns:
-            moved = [move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
+        still = replace(self, scenarios=tuple(edge_scenes.place_on_grid(s) for s in self.scenarios))
+        turns = {"shifted": 0.0, "turned by 90 degrees": math.pi / 2}
+        turns["turned by 53.13 degrees"] = edge_scenes.EXACT_TURN_RAD
+        for name, turn in turns.items():
+            moved = [edge_scenes.move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
             batch = self.collate(moved)
             # origins of map frames lie on whole meters, so no origin follows a scenario exactly
             origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
@@ -609,13 +603,13 @@ class Rules(_Subject):
         """The rollouts are the same where tracks and lights end at the current step, as in a test split."""
         if not all(scenario.has_future for scenario in self.scenarios):
             raise _NotApplicable("a scenario has no logged future")
-        batch = self.collate([without_future(scenario) for scenario in self.scenarios])
+        batch = self.collate([edge_scenes.without_future(scenario) for scenario in self.scenarios])
         return _check_gap(self.simulate(batch).position, self.rollouts.position, POSE_TOLERANCE_M, "apart (m)")
 
     def edge_cases_can_be_simulated_and_scored(self) -> str:
         """Simulations and scores succeed: one agent, 128, no map, no lights, agents first seen now or never, NaN."""
         gaps = {}
-        for name, scenario in edge_scenes(self.scenarios[0]).items():
+        for name, scenario in edge_scenes.edge_scenes(self.scenarios[0]).items():
             batch = self.collate([scenario])
             rollouts = self.simulate(batch)
             if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):

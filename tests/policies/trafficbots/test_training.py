@@ -129,7 +129,7 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
         own = torch.from_numpy(destination_labels(scenario, None))
         row[: len(own)] = own
     draws = replace(draw_training(scene, SETTINGS, 0.3, hide=False), from_prior=False)
-    found = compute_scene_loss(network, SETTINGS, scene, labels, scene.agent_mask, draws)
+    found = compute_scene_loss(network, scene, labels, scene.agent_mask, draws)
     two_passes = torch.autograd.grad(found.loss, weights, allow_unused=True)
 
     # The imitation loss alone, step by step with gradient; the other terms are the same in both.

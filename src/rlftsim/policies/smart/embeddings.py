@@ -187,14 +187,11 @@ class TabulatedEmbedding:
         # fractional index into each input's grid [E, n], and the grid point below it
         grid_index = torch.minimum(((values - self.start) / self.spacing).clamp(min=0), self.last)
         low = torch.minimum(grid_index.floor(), self.last - 1)
-        weight = grid_index - low
+        upper = grid_index - low  # weight of the upper neighbor
         row = low.long() + self.first_row
         # one bag per relation: both neighbors of every input, weighted; no tensor [E, 2n, D] is made
         return functional.embedding_bag(
-            torch.cat([row, row + 1], -1),
-            self.table,
-            mode="sum",
-            per_sample_weights=torch.cat([1 - weight, weight], -1),
+            torch.cat([row, row + 1], -1), self.table, mode="sum", per_sample_weights=torch.cat([1 - upper, upper], -1)
         )
 
     @property

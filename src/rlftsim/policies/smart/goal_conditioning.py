@@ -222,10 +222,7 @@ class GoalLogitBias(nn.Module):
 
 @torch.no_grad()
 def suitability(
-    goal: Float[Tensor, "g 2"],
-    num_left: Int64[Tensor, "g"],
-    class_id: Int64[Tensor, "g"],
-    moves: Float[Tensor, "C V 2"],
+    goal: Float[Tensor, "g 2"], num_left: Int64[Tensor, "g"], class_id: Int64[Tensor, "g"], ends: Float[Tensor, "C V 2"]
 ) -> Float[Tensor, "g 3 V"]:
     """Features of `GoalLogitBias`: progress, minus pace, minus direction; larger for a token that suits better.
 
@@ -233,12 +230,12 @@ def suitability(
         goal: Goal of each row, meters, in the agent's frame.
         num_left: Number of decisions left, the next included, from 1 to 16.
         class_id: Agent class that each row's token ids refer to.
-        moves: Displacement by each token, meters, in the agent's frame.
+        ends: Displacement by each token, meters, in the agent's frame.
     """
-    features = goal.new_empty(len(goal), 3, moves.shape[1])
+    features = goal.new_empty(len(goal), 3, ends.shape[1])
     left_s = (num_left[:, None] - 1).to(goal.dtype) * TOKEN_S  # [g, 1]
     # in blocks, and in place where possible: at 2048 tokens these [r, V] tensors dominate a rollout's time
-    for rows, move in _row_blocks(class_id, moves):
+    for rows, move in _row_blocks(class_id, ends):
         x, y = move.unbind(-1)  # [V] or [r, V]
         speed = move.norm(dim=-1) / TOKEN_S
         (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]  # [r, 1]

@@ -193,7 +193,7 @@ class SmartModel(nn.Module):
             agent_features=decoder.embed_agents(class_id, scenarios.size),
             token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
             token_keys=None if decoder.scores is None else decoder.scores.keys(self.vocabulary.poses[:, :, -1]),
-            relations=decoder.relations(),
+            **decoder.relations(),
             max_map_tokens=max_map_tokens,
         )
 

@@ -70,7 +70,9 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
-    relations: "Relations"
+    time_relation: RelationEmbedding
+    map_relation: RelationEmbedding
+    agent_relation: RelationEmbedding
     max_map_tokens: int | None = None
     """No agent has more map tokens within reach, in any position. None on the CPU, which counts at every step."""
     token_keys: TokenKeys | None = None
@@ -80,15 +82,6 @@ class Scene:
     def map_poses(self) -> Poses:
         """Poses [B M] of all map tokens, scenario after scenario."""
         return Poses(self.map_position.flatten(0, 1), self.map_heading.flatten())
-
-
-@dataclass(frozen=True, eq=False)
-class Relations:
-    """Embeddings of the decoder's relations."""
-
-    time: RelationEmbedding
-    map: RelationEmbedding
-    agent: RelationEmbedding
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,19 +102,13 @@ class Past:
             steps: Block of steps that follows the past.
             row: Row of `sources` that the block's features will have, -1 where there is none.
         """
-        return Past(
-            torch.cat([self.position, steps.position], 3),
-            torch.cat([self.heading, steps.heading], 3),
-            torch.cat([self.row, row], 3),
-            self.sources,
-        )
+        pairs = ((self.position, steps.position), (self.heading, steps.heading), (self.row, row))
+        return Past(*(torch.cat(pair, 3) for pair in pairs), self.sources)
 
     def repeat(self, num_rollouts: int) -> "Past":
         """The past of a single rollout, shared by N rollouts."""
-        position, heading, row = (
-            value.expand(-1, num_rollouts, *value.shape[2:]) for value in (self.position, self.heading, self.row)
-        )
-        return Past(position, heading, row, self.sources)
+        tensors = (self.position, self.heading, self.row)
+        return Past(*(values.expand(-1, num_rollouts, *values.shape[2:]) for values in tensors), self.sources)
 
     def without_last_step(self) -> "Past":
         """The past before the last step. Rows of the sources that are no longer referred to stay."""
@@ -171,10 +158,8 @@ class MapEncoder(nn.Module):
         self.kind = nn.Embedding(NUM_FAMILIES, dim)
         self.light = nn.Embedding(NUM_LIGHTS, dim)
         self.relation = FourierEmbedding(3, dim, config.num_frequencies)
-        self.layers = nn.ModuleList(
-            RelationAttention(dim, config.num_heads, config.head_dim, config.dropout)
-            for _ in range(config.num_map_layers)
-        )
+        sizes = (dim, config.num_heads, config.head_dim, config.dropout)
+        self.layers = nn.ModuleList(RelationAttention(*sizes) for _ in range(config.num_map_layers))
 
     def forward(self, tokens: MapTokens, prototypes: Float[Tensor, "P 11 2"]) -> Float[Tensor, "BM D"]:
         """Features of all map tokens, scenario after scenario. Padding has arbitrary finite features.
@@ -245,15 +230,15 @@ class AgentDecoder(nn.Module):
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return tuple(module for module in (self.goal, self.aim) if module is not None)
 
-    def relations(self) -> Relations:
-        """The relation embeddings, tabulated unless a gradient has to be exact."""
+    def relations(self) -> dict[str, RelationEmbedding]:
+        """The relation embeddings by field of a scene, tabulated unless a gradient has to be exact."""
         # lags are whole numbers of tokens, so their grid has exactly these points
         lag = Grid(-float(self.config.history_tokens), 0.0, self.config.history_tokens + 1)
-        return Relations(
-            time=tabulate(self.time_relation, MAX_LOOK_BACK_M, lag),
-            map=tabulate(self.map_relation, self.config.agent_map_radius_m),
-            agent=tabulate(self.agent_relation, self.config.agent_radius_m),
-        )
+        return {
+            "time_relation": tabulate(self.time_relation, MAX_LOOK_BACK_M, lag),
+            "map_relation": tabulate(self.map_relation, self.config.agent_map_radius_m),
+            "agent_relation": tabulate(self.agent_relation, self.config.agent_radius_m),
+        }
 
     def embed_agents(self, class_id: Int64[Tensor, "B A"], size: Float[Tensor, "B A 3"]) -> Float[Tensor, "B A D"]:
         """Embedding of class and size.
@@ -282,13 +267,7 @@ class AgentDecoder(nn.Module):
         return tuple(layer.fold() for block in layers for layer in block)  # type: ignore[operator]
 
     def look(
-        self,
-        scene: Scene,
-        steps: TokenSteps,
-        past: Past | None,
-        hidden: Bool[Tensor, "B N A K"] | None = None,
-        *,
-        padded: bool = False,
+        self, scene: Scene, steps: TokenSteps, past: Past | None, hidden: Tensor | None = None, *, padded: bool = False
     ) -> View:
         """The rows of a block and their neighbors, which the layers only read.
 
@@ -298,7 +277,7 @@ class AgentDecoder(nn.Module):
             scene: Map, agents and embeddings of relations, in the frame of the steps.
             steps: Block of steps whose valid elements become rows.
             past: Past of earlier blocks; None = the block begins the scenario.
-            hidden: True = the (agent, step) pair takes no part in the attention over time.
+            hidden: True = the (agent, step) pair, of [B, N, A, K], takes no part in the attention over time.
             padded: Whether padding has rows, too, which no row attends to, and lists have fixed widths.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
@@ -333,11 +312,11 @@ class AgentDecoder(nn.Module):
         agent_relation = relative_pose(poses, poses[agent_row], seam_rad=self.config.seam_rad)
         return View(
             rows, poses, past,
-            history=build(scene.relations.time, *self._find_history(past, steps, rows, poses, hidden)),
+            history=build(scene.time_relation, *self._find_history(past, steps, rows, poses, hidden)),
             map_tokens=build(
-                scene.relations.map, map_relation, tokens.index, tokens.mask, features=scene.map_features, groups=groups
+                scene.map_relation, map_relation, tokens.index, tokens.mask, features=scene.map_features, groups=groups
             ),
-            agents=build(scene.relations.agent, agent_relation, agent_row, agents.mask),
+            agents=build(scene.agent_relation, agent_relation, agent_row, agents.mask),
         )  # fmt: skip
 
     def forward(

@@ -41,7 +41,7 @@ POSITION_WEIGHT, HEADING_WEIGHT, SPEED_WEIGHT, PERSONALITY_WEIGHT = 0.1, 10.0, 0
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingDraws:
+class Draws:
     """All random values of an update."""
 
     noise: Float[Tensor, "B A 16"]
@@ -57,23 +57,18 @@ class TrainingDraws:
 
 
 def imitation_loss(
-    network: TrafficBotsNetwork,
-    config: TrafficBotsConfig,
-    batch: ScenarioBatch,
-    trained: Bool[Tensor, "B A"],
-    update: int,
+    network: TrafficBotsNetwork, batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int
 ) -> ImitationLoss:
     """Loss of an update, a sum of means over each scenario.
 
     Args:
-        network: Network with the weights. In training mode inputs are hidden and agents forced by schedule; in
-            evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
-        config: Settings with the schedule of forcing, and probabilities.
+        network: Network with weights and settings. In training mode inputs are hidden and agents forced by schedule;
+            in evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
         batch: Scenarios with logged futures, the targets of imitation.
         trained: True = the agent counts; other agents are context.
         update: Number of the update of pre-training from 0.
     """
-    scene = build_scene(batch, TOTAL_STEPS, config.max_map_tokens)
+    config, scene = network.config, build_scene(batch, TOTAL_STEPS, network.config.max_map_tokens)
     labels = np.full(trained.shape, NO_DESTINATION)
     for row, scenario in zip(labels, batch.scenarios):
         destinations = destination_labels(scenario, config.max_map_tokens)
@@ -83,10 +78,10 @@ def imitation_loss(
     stage = min(update // config.forcing_updates, stages) if network.training else stages
     draws = draw_training(scene, config, config.forced_fractions[stage], hide=network.training)
     destination = torch.from_numpy(labels).to(trained.device)
-    return compute_scene_loss(network, config, scene, destination, trained & scene.agent_mask, draws)
+    return compute_scene_loss(network, scene, destination, trained & scene.agent_mask, draws)
 
 
-def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, hide: bool) -> TrainingDraws:
+def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, hide: bool) -> Draws:
     """Draw all random values of an update with torch's generator.
 
     Args:
@@ -106,24 +101,18 @@ def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, h
         nodes, steps = (torch.rand(mask.shape).to(device) >= config.input_drop for mask in (node_mask, history_mask))
         nodes[..., 0], steps[..., -1] = True, True
         node_mask, history_mask = node_mask & nodes, history_mask & steps
-    return TrainingDraws(noise, from_prior, forced, node_mask, history_mask)
+    return Draws(noise, from_prior, forced, node_mask, history_mask)
 
 
 def compute_scene_loss(
-    network: TrafficBotsNetwork,
-    config: TrafficBotsConfig,
-    scene: Scene,
-    destination: Int64[Tensor, "B A"],
-    trained: Bool[Tensor, "B A"],
-    draws: TrainingDraws,
+    network: TrafficBotsNetwork, scene: Scene, labels: Int64[Tensor, "B A"], trained: Bool[Tensor, "B A"], draws: Draws
 ) -> ImitationLoss:
     """Loss of a scene with random values that have been drawn.
 
     Args:
         network: Network with the weights to be trained.
-        config: Settings with `free_nats`.
         scene: Scene with all 91 steps of the log.
-        destination: Label of each agent, a map token; negative = none.
+        labels: Map token of each agent's destination; negative = none.
         trained: True = the agent counts; other agents are context.
         draws: Random values, from `draw_training`.
     """
@@ -135,11 +124,11 @@ def compute_scene_loss(
     mean = network.posterior(windows, scene.light_state[:, None, :, steps], scene, map_features)
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
-    conditioning = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
+    conditioning = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
     context = network.agents.context(scene, map_features, light_features[:, CURRENT_STEP:])
 
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
-    rollout = _roll_out(network, context, conditioning, destination[:, None], draws.forced)
+    rollout = _roll_out(network, context, conditioning, labels[:, None], draws.forced)
     value, grad = _differentiate_actions(scene, rollout, trained)
     features = network.features_over_time(rollout.history, rollout.active, context, conditioning)  # [B, T, 1, A, D]
     actions = network.mean_actions(features, scene).movedim(1, 3)  # [B, 1, A, T, 2]
@@ -148,11 +137,11 @@ def compute_scene_loss(
     # 3. Terms of values that are drawn once, for agents that are simulated at all.
     counts = trained & rollout.alive.any(-1)[:, 0]
     log_prob = network.destination_predictor(history_windows(scene), scene, map_features, draws.history_mask)
-    nll = -log_prob.gather(-1, destination.clamp(min=0)[..., None])[..., 0]  # [B, A]
+    nll = -log_prob.gather(-1, labels.clamp(min=0)[..., None])[..., 0]  # [B, A]
     losses = {
         "imitation_loss": value + (surrogate - surrogate.detach()),  # value of the loss, gradient of the sum
-        "personality_loss": _average_by_scenario(personality_kl(mean, log_std, config.free_nats), counts),
-        "destination_loss": _average_by_scenario(nll, counts & (destination >= 0) & nll.isfinite()),
+        "personality_loss": _average_by_scenario(personality_kl(mean, log_std, network.config.free_nats), counts),
+        "destination_loss": _average_by_scenario(nll, counts & (labels >= 0) & nll.isfinite()),
         "light_loss": light_loss,
     }
     sums = {name: value.detach() for name, value in losses.items()}

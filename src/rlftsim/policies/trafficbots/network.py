@@ -73,9 +73,8 @@ class MapEncoder(nn.Module):
         self.config = config
         self.nodes = mlp(len(MapTokenType) + NUM_NODES, width, width, width)
         self.polyline = PolylineEncoder(config.dim, config.dropout)
-        self.layers = nn.ModuleList(
-            SelfLayer(config.dim, config.num_heads, config.dropout) for _ in range(config.num_map_layers)
-        )
+        sizes = (config.dim, config.num_heads, config.dropout)
+        self.layers = nn.ModuleList(SelfLayer(*sizes) for _ in range(config.num_map_layers))
 
     def forward(self, scene: Scene, node_mask: Bool[Tensor, "B M 20"]) -> Float[Tensor, "B M D"]:
         """Features of all map tokens, 0 for padding.
@@ -116,7 +115,7 @@ def segment_features(pose: Float[Tensor, "*g 3"]) -> Float[Tensor, "*g 7"]:
 
 
 @dataclass(frozen=True, eq=False)
-class LightNeighborhoods:
+class LightNeighbors:
     """Lights and the neighbors of lights."""
 
     base: Float[Tensor, "B L D"]
@@ -138,11 +137,10 @@ class LightEncoder(nn.Module):
         self.window = window
         self.states = mlp(NUM_LIGHT_STATES + window, dim, dim, dim)
         self.polyline = PolylineEncoder(dim, config.dropout)
-        self.layers = nn.ModuleList(
-            DecoderLayer(dim, config.num_heads, config.dropout) for _ in range(config.num_light_layers)
-        )
+        sizes = (dim, config.num_heads, config.dropout)
+        self.layers = nn.ModuleList(DecoderLayer(*sizes) for _ in range(config.num_light_layers))
 
-    def neighborhoods(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightNeighborhoods:
+    def neighborhoods(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightNeighbors:
         """Values that the states of lights do not change, computed once.
 
         Args:
@@ -152,7 +150,7 @@ class LightEncoder(nn.Module):
         config, map_features = self.config, map_features.detach()
         lights = scene.light_pose
         find = partial(find_neighbors, count=config.light_neighbors, radius_m=config.light_radius_m, size=config.dim)
-        return LightNeighborhoods(
+        return LightNeighbors(
             base=map_features.gather(1, scene.light_token[..., None].expand(-1, -1, config.dim)),
             mask=scene.light_mask,
             lights=find(lights, lights, scene.light_mask),
@@ -161,27 +159,24 @@ class LightEncoder(nn.Module):
         )
 
     def forward(
-        self,
-        state: Int64[Tensor, "B T L W"],
-        neighborhoods: LightNeighborhoods,
-        step_mask: Bool[Tensor, "T W"] | None = None,
+        self, state: Int64[Tensor, "B T L W"], neighbors: LightNeighbors, step_mask: Bool[Tensor, "T W"] | None = None
     ) -> Float[Tensor, "B T L D"]:
         """Features of all lights at T decisions, 0 for padding.
 
         Args:
             state: States of the lights in each window, the newest last.
-            neighborhoods: Result of `neighborhoods` for the same scene.
+            neighbors: Result of `neighborhoods` for the same scene.
             step_mask: True = the step of the window exists; None = all steps exist.
         """
-        base, num_decisions = neighborhoods.base, state.shape[1]
+        base, num_decisions = neighbors.base, state.shape[1]
         step_index = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
         attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).to(base), step_index], -1)
-        mask = neighborhoods.mask[:, None].expand(state.shape[:3])  # [B, T, L]
+        mask = neighbors.mask[:, None].expand(state.shape[:3])  # [B, T, L]
         x = self.states(attributes) + base[:, None, :, None]
         steps = mask[..., None].expand(state.shape)
         x = self.polyline(x, steps if step_mask is None else steps & step_mask[:, None])
-        lights, map_neighbors = (n.over_time(num_decisions) for n in (neighborhoods.lights, neighborhoods.map))
-        for layer, map_tokens in zip(self.layers, neighborhoods.map_tokens):
+        lights, map_neighbors = (n.over_time(num_decisions) for n in (neighbors.lights, neighbors.map))
+        for layer, map_tokens in zip(self.layers, neighbors.map_tokens):
             x = layer(x, mask, lights, [(map_tokens, map_neighbors)])
         return x
 
@@ -280,9 +275,8 @@ class AgentEncoder(nn.Module):
         super().__init__()
         self.config = config
         self.windows = WindowEncoder(config.dim, window, dropout)
-        self.layers = nn.ModuleList(
-            DecoderLayer(config.dim, config.num_heads, dropout) for _ in range(config.num_agent_layers)
-        )
+        sizes = (config.dim, config.num_heads, dropout)
+        self.layers = nn.ModuleList(DecoderLayer(*sizes) for _ in range(config.num_agent_layers))
 
     def context(
         self, scene: Scene, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]
@@ -434,21 +428,17 @@ class Posterior(nn.Module):
         self.log_std = nn.Parameter(torch.zeros(LATENT_SIZE))
 
     def forward(
-        self,
-        windows: Windows,
-        light_state: Int64[Tensor, "B 1 L W"],
-        scene: Scene,
-        map_features: Float[Tensor, "B M D"],
+        self, windows: Windows, states: Int64[Tensor, "B 1 L W"], scene: Scene, map_features: Float[Tensor, "B M D"]
     ) -> Float[Tensor, "B A 16"]:
         """Means of a diagonal Gaussian with log standard deviations `log_std`.
 
         Args:
             windows: Windows [B, 1, 1, A, 19] of every fifth step of the log.
-            light_state: States of the lights at the same steps.
+            states: States of the lights at the same steps.
             scene: Scene with map, sizes and classes.
             map_features: Features from `MapEncoder`; receive gradient from agents, none from lights.
         """
-        lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
+        lights = self.lights(states, self.lights.neighborhoods(scene, map_features))
         context = self.agents.context(scene, map_features, lights)
         return at_least_float32(self.mean(self.agents(windows, context)[:, 0, 0]))
 

@@ -289,7 +289,7 @@ class TrafficBotsPolicy(nn.Module):
             trained: True = the agent counts; other agents are context.
             update: Number of the update from 0; in training mode the fraction of agents that follow the log falls.
         """
-        return imitation_loss(self.network, self.config, scenarios, trained, update)
+        return imitation_loss(self.network, scenarios, trained, update)
 
     # ---- states, means and distributions -----------------------------------------------------------------------------
 
