@@ -9,14 +9,9 @@ from dataclasses import dataclass, replace
 from rlftsim.errors import ConfigError, in_short
 
 HISTOGRAM_FEATURES = (
-    "linear_speed",
-    "linear_acceleration",
-    "angular_speed",
-    "angular_acceleration",
-    "distance_to_nearest_object",
-    "time_to_collision",
-    "distance_to_road_edge",
-)
+    "linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration",
+    "distance_to_nearest_object", "time_to_collision", "distance_to_road_edge",
+)  # fmt: skip
 BERNOULLI_FEATURES = ("collision_indication", "offroad_indication", "traffic_light_violation")
 FEATURE_NAMES = HISTOGRAM_FEATURES + BERNOULLI_FEATURES
 """Order of the feature axis F."""

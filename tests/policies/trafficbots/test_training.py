@@ -10,11 +10,10 @@ import scenes
 import tiny
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
 from rlftsim.policies.trafficbots.imitation import compute_scene_loss, draw_training, imitation_terms
 from rlftsim.policies.trafficbots.network import Windows
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
-from rlftsim.policies.trafficbots.scene import build_scene
+from rlftsim.policies.trafficbots.scene import NO_DESTINATION, build_scene, destination_labels
 from rlftsim.policies.trafficbots.state import ImposedStates, max_action, move, start_traffic
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate

@@ -17,12 +17,16 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.goals.maneuvers.lane_paths import (
+    BRISK,
+    HORIZON_S,
     LONGEST_UTURN_M,
     MAX_LANE_DISTANCE_M,
     LanePath,
     Lanes,
     Pose,
+    Reach,
     change_length_m,
+    compute_reach,
     ease_m,
     lane_change_paths,
     lanes_for,
@@ -31,7 +35,6 @@ from rlftsim.goals.maneuvers.lane_paths import (
     shorten_path,
     uturn_paths,
 )
-from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S, Reach, compute_reach
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, STRAIGHT_RAD, Maneuver, classify_turn

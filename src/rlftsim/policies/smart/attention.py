@@ -421,15 +421,10 @@ class RelationAttention(nn.Module):
         self.gate = nn.Linear(inner + dim, inner)
         self.out = nn.Linear(inner, dim)
         self.out_norm = nn.LayerNorm(dim)
-        wide = 4 * dim
         self.feed_forward = nn.Sequential(
-            nn.LayerNorm(dim),
-            nn.Linear(dim, wide),
-            nn.ReLU(),
-            Dropout(dropout),
-            nn.Linear(wide, dim),
-            nn.LayerNorm(dim),
-        )
+            nn.LayerNorm(dim), nn.Linear(dim, 4 * dim), nn.ReLU(), Dropout(dropout),
+            nn.Linear(4 * dim, dim), nn.LayerNorm(dim),
+        )  # fmt: skip
 
     def forward(
         self,

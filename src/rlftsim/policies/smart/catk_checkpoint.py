@@ -64,37 +64,20 @@ _SUBMODULES = (
 """Prefix of a submodule of the network here, its prefix in the public code, and the type of the submodule."""
 _IN_FOURIER = {"frequencies": "freqs", "inputs": "mlps", "out": "to_out"}
 _IN_ATTENTION = {
-    "query": "to_q",
-    "source_key": "to_k",
-    "relation_key": "to_k_r",
-    "source_value": "to_v",
-    "relation_value": "to_v_r",
-    "skip": "to_s",
-    "gate": "to_g",
-    "out": "to_out",
-    "target_norm": "attn_prenorm_x_dst",
-    "source_norm": "attn_prenorm_x_src",
-    "relation_norm": "attn_prenorm_r",
-    "out_norm": "attn_postnorm",
-    "feed_forward.0": "ff_prenorm",
-    "feed_forward.1": "ff_mlp.0",
-    "feed_forward.4": "ff_mlp.3",
-    "feed_forward.5": "ff_postnorm",
-}
+    "query": "to_q", "skip": "to_s", "gate": "to_g", "out": "to_out",
+    "source_key": "to_k", "relation_key": "to_k_r", "source_value": "to_v", "relation_value": "to_v_r",
+    "target_norm": "attn_prenorm_x_dst", "source_norm": "attn_prenorm_x_src",
+    "relation_norm": "attn_prenorm_r", "out_norm": "attn_postnorm",
+    "feed_forward.0": "ff_prenorm", "feed_forward.1": "ff_mlp.0",
+    "feed_forward.4": "ff_mlp.3", "feed_forward.5": "ff_postnorm",
+}  # fmt: skip
 PRESETS = {"nano": smart_nano, "mini": smart_mini, "tiny": smart_tiny}
 _FIELD_OF_SETTING = {
-    "hidden_dim": "dim",
-    "num_freq_bands": "num_frequencies",
-    "num_heads": "num_heads",
-    "head_dim": "head_dim",
-    "num_map_layers": "num_map_layers",
-    "num_agent_layers": "num_decoder_layers",
-    "pl2pl_radius": "map_radius_m",
-    "pl2a_radius": "agent_map_radius_m",
-    "a2a_radius": "agent_radius_m",
-    "dropout": "dropout",
-    "hist_drop_prob": "history_drop",
-}
+    "hidden_dim": "dim", "num_freq_bands": "num_frequencies", "num_heads": "num_heads", "head_dim": "head_dim",
+    "num_map_layers": "num_map_layers", "num_agent_layers": "num_decoder_layers",
+    "pl2pl_radius": "map_radius_m", "pl2a_radius": "agent_map_radius_m", "a2a_radius": "agent_radius_m",
+    "dropout": "dropout", "hist_drop_prob": "history_drop",
+}  # fmt: skip
 _SHAPE_PROBE = PREFIX + "agent_encoder.t_attn_layers.0.to_q.weight"
 _HEAD_BIAS = PREFIX + "agent_encoder.token_predict_head.mlp.3.bias"
 

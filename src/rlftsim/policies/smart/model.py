@@ -25,17 +25,14 @@ from rlftsim.policies.distributions import (
     TokenRows,
 )
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
-from rlftsim.policies.smart.embeddings import normalize
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
 from rlftsim.policies.smart.heads import ClassHeads
-from rlftsim.policies.smart.neighbors import bound_neighbors
-from rlftsim.policies.smart.network import Scene, SmartNetwork, mask_positions
+from rlftsim.policies.smart.network import Scene, SmartNetwork
 from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
-from rlftsim.tokens.map_tokens import tokenize_map
-from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
+from rlftsim.tokens.vocabulary import Vocabulary
 
 VOCABULARY = "vocabulary.safetensors"
 
@@ -176,26 +173,7 @@ class SmartModel(nn.Module):
     # ---- parts of a forward pass ----------------------------------------------------------------------------------
 
     def _build_scene(self, scenarios: ScenarioBatch) -> Scene:
-        tokens = tokenize_map(scenarios, self.vocabulary.map_prototypes)
-        class_id = class_of_type(scenarios.object_type)
-        decoder = self.network.decoder
-        max_map_tokens = None
-        if self.config.max_agent_map_neighbors is None and tokens.position.device.type != "cpu":
-            # the host waits for the bound once, and not at every decision
-            candidates = mask_positions(tokens.token_mask, tokens.position)
-            max_map_tokens = bound_neighbors(candidates, self.config.agent_map_radius_m)
-        return Scene(
-            map_position=tokens.position,
-            map_heading=tokens.heading,
-            map_mask=tokens.token_mask,
-            map_features=normalize(self.network.map_encoder(tokens, self.vocabulary.map_prototypes)),
-            class_id=class_id,
-            agent_features=decoder.embed_agents(class_id, scenarios.size),
-            token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
-            token_keys=None if decoder.scores is None else decoder.scores.keys(self.vocabulary.poses[:, :, -1]),
-            **decoder.relations(),
-            max_map_tokens=max_map_tokens,
-        )
+        return self.network.build_scene(scenarios, self.vocabulary)
 
     def _tokenize(self, scenarios: ScenarioBatch) -> AgentTokens:
         return tokenize_agents(scenarios, self.vocabulary, catk_compat=self.config.catk_compat)

@@ -46,11 +46,12 @@ from rlftsim.policies.smart.goal_conditioning import (
     select_rows,
 )
 from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
-from rlftsim.policies.smart.neighbors import Poses, find_neighbors, group_rows, relative_pose
+from rlftsim.policies.smart.neighbors import Poses, bound_neighbors, find_neighbors, group_rows, relative_pose
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import find_rows, place_rows
-from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens
-from rlftsim.tokens.vocabulary import CLASS_NAMES
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens, tokenize_map
+from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary, class_of_type
 
 MAX_LOOK_BACK_M = 160.0
 """Largest distance between an agent and the remembered positions (3 s at 50 m/s), for tables."""
@@ -430,6 +431,34 @@ class SmartNetwork(nn.Module):
         initialize(self, config.frequency_init)
         if self.decoder.goal is not None:
             self.decoder.goal.zero_init()
+
+    def build_scene(self, scenarios: ScenarioBatch, vocabulary: Vocabulary) -> Scene:
+        """Inputs of the decoder beside the agents' motion, from the maps and agents of a batch.
+
+        Args:
+            scenarios: Scenarios with maps and agents, map frame.
+            vocabulary: Motion tokens of the agents, and prototypes of map tokens.
+        """
+        tokens = tokenize_map(scenarios, vocabulary.map_prototypes)
+        class_id = class_of_type(scenarios.object_type)
+        decoder = self.decoder
+        max_map_tokens = None
+        if decoder.config.max_agent_map_neighbors is None and tokens.position.device.type != "cpu":
+            # the host waits for the bound once, and not at every decision
+            candidates = mask_positions(tokens.token_mask, tokens.position)
+            max_map_tokens = bound_neighbors(candidates, decoder.config.agent_map_radius_m)
+        return Scene(
+            map_position=tokens.position,
+            map_heading=tokens.heading,
+            map_mask=tokens.token_mask,
+            map_features=normalize(self.map_encoder(tokens, vocabulary.map_prototypes)),
+            class_id=class_id,
+            agent_features=decoder.embed_agents(class_id, scenarios.size),
+            token_features=decoder.embed_tokens(vocabulary.end_corners()),
+            token_keys=None if decoder.scores is None else decoder.scores.keys(vocabulary.poses[:, :, -1]),
+            **decoder.relations(),
+            max_map_tokens=max_map_tokens,
+        )
 
     def scene_weights(self) -> list[Tensor]:
         """Weights that scenes and views are made with: all but those of the decoder's `reader_modules`."""

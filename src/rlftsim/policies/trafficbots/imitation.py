@@ -22,7 +22,6 @@ from torch import Tensor
 from torch.nn.functional import pad, smooth_l1_loss
 
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
-from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
 from rlftsim.policies.trafficbots.network import (
     POSTERIOR_STRIDE,
     AgentConditioning,
@@ -31,7 +30,7 @@ from rlftsim.policies.trafficbots.network import (
     Windows,
     history_windows,
 )
-from rlftsim.policies.trafficbots.scene import Scene, build_scene
+from rlftsim.policies.trafficbots.scene import NO_DESTINATION, Scene, build_scene, destination_labels
 from rlftsim.policies.trafficbots.state import ImposedStates, join_history, max_action, move, start_traffic
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.scenario.batch import ScenarioBatch

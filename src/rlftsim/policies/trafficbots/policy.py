@@ -21,10 +21,9 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.checkpoint import are_frozen_alike, load_network, read_model, save_model
 from rlftsim.policies.distributions import GaussianDistribution, standard_normal
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
-from rlftsim.policies.trafficbots.destinations import PEDESTRIAN, VEHICLE
 from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.network import NUM_CLASSES, TrafficBotsNetwork, history_windows
-from rlftsim.policies.trafficbots.scene import Scene, build_scene
+from rlftsim.policies.trafficbots.scene import PEDESTRIAN, VEHICLE, Scene, build_scene
 from rlftsim.policies.trafficbots.state import (
     Memo,
     Record,
