@@ -89,12 +89,12 @@ class Scene:
 class Past:
     """Steps of earlier blocks, as sources of the attention over time."""
 
+    sources: tuple[Float[Tensor, "S D"], ...]
+    """Normalized inputs of each layer's attention over time."""
     position: Float[Tensor, "B N A P 2"]
     heading: Float[Tensor, "B N A P"]
     row: Int64[Tensor, "B N A P"]
     """Row of `sources`, -1 where there is none."""
-    sources: tuple[Float[Tensor, "S D"], ...]
-    """Normalized inputs of each layer's attention over time."""
 
     def append(self, steps: TokenSteps, row: Int64[Tensor, "B N A K"]) -> "Past":
         """The past with a block's poses appended, and the sources unchanged.
@@ -104,16 +104,16 @@ class Past:
             row: Row of `sources` that the block's features will have, -1 where there is none.
         """
         pairs = ((self.position, steps.position), (self.heading, steps.heading), (self.row, row))
-        return Past(*(torch.cat(pair, 3) for pair in pairs), self.sources)
+        return Past(self.sources, *(torch.cat(pair, 3) for pair in pairs))
 
     def repeat(self, num_rollouts: int) -> "Past":
         """The past of a single rollout, shared by N rollouts."""
         tensors = (self.position, self.heading, self.row)
-        return Past(*(values.expand(-1, num_rollouts, *values.shape[2:]) for values in tensors), self.sources)
+        return Past(self.sources, *(values.expand(-1, num_rollouts, *values.shape[2:]) for values in tensors))
 
     def without_last_step(self) -> "Past":
         """The past before the last step. Rows of the sources that are no longer referred to stay."""
-        return Past(self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1], self.sources)
+        return Past(self.sources, self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1])
 
     def last(self, num_steps: int) -> "Past":
         """The last steps, with padding where there are fewer, and as many sources for every agent.
@@ -124,10 +124,10 @@ class Past:
         row = functional.pad(self.row, (num_added, 0), value=-1)
         selected = row.flatten().clamp(min=0)
         return Past(
+            tuple(source.index_select(0, selected) for source in self.sources),
             functional.pad(self.position, (0, 0, num_added, 0)),
             functional.pad(self.heading, (num_added, 0)),
             torch.where(row >= 0, torch.arange(len(selected), device=row.device).view_as(row), -1),
-            tuple(source.index_select(0, selected) for source in self.sources),
         )
 
 
@@ -287,7 +287,7 @@ class AgentDecoder(nn.Module):
         index = torch.arange(len(agent), device=agent.device)
         element_row = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]
         source_row = torch.where(element_row >= 0, element_row + num_sources, -1)
-        past = Past(steps.position, steps.heading, source_row, ()) if past is None else past.append(steps, source_row)
+        past = Past((), steps.position, steps.heading, source_row) if past is None else past.append(steps, source_row)
         poses = Poses(steps.position, steps.heading)[rows]
         build = partial(build_neighborhoods, dim=self.config.dim, padded=padded)
         # 2. map tokens. Agents that stand are at the same pose in many steps and rollouts, and share a list. But in

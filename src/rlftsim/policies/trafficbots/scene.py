@@ -217,7 +217,7 @@ class DestinationMap:
         is_lane = np.isin(map_tokens.type, VEHICLE_LANES)
         self.last_tokens = {int(id_): int(k) for k, id_ in enumerate(map_tokens.feature_id) if is_lane[k]}
         nodes = {types: map_tokens.node_mask & np.isin(map_tokens.type, types)[:, None] for types in NODE_TYPES}
-        self.nodes = {
+        self.nodes: dict[tuple[int, ...], tuple[np.ndarray, ...]] = {
             types: (np.nonzero(mask)[0], map_tokens.position[mask][:, :2], map_tokens.direction[mask][:, :2])
             for types, mask in nodes.items()
         }
