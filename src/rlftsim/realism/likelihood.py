@@ -58,15 +58,9 @@ def histogram_table(config: MetricConfig, device: torch.device) -> HistogramTabl
         edges[row, : histogram.num_bins + 1] = compute_bin_edges(histogram)
     rows = [[h.low, h.high, h.pseudocount, h.num_bins] for h in histograms]  # [H, 4]
     low, high, pseudocount, num_bins = torch.tensor(rows, device=device).unbind(1)
-    return HistogramTable(
-        edges=torch.from_numpy(edges).to(device),
-        low=low,
-        high=high,
-        last_bin=num_bins.long() - 1,
-        pseudocount=pseudocount,
-        num_bins=num_bins,
-        bernoulli_pseudocount=torch.tensor([b.pseudocount for b in config.bernoullis], device=device),
-    )
+    bernoulli = torch.tensor([b.pseudocount for b in config.bernoullis], device=device)
+    edges = torch.from_numpy(edges).to(device)
+    return HistogramTable(edges, low, high, num_bins.long() - 1, pseudocount, num_bins, bernoulli)
 
 
 def find_bins(values: Float[Tensor, "H m"], table: HistogramTable) -> Int64[Tensor, "H m"]:

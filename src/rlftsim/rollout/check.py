@@ -284,28 +284,6 @@ def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], A
     return force
 
 
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """Many draws of the first decision of the smallest scenario."""
-
-    distribution: DecisionDistribution
-    """[1, N, A]."""
-    decisions: list[Tensor]
-    log_prob: Tensor
-    """[K, N, A], under the distribution that was drawn from."""
-    mask: Tensor
-    """[A], True = a simulated agent."""
-
-
-def _check_means(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
-    """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A], or `_Broken` with the text."""
-    # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
-    flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
-    error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
-    gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
-    return _check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
-
-
 def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
     def moved(position: Tensor) -> Tensor:
         # In float64, rounded once at the end.
@@ -405,24 +383,24 @@ class Rules(_Subject):
 
     def entropy_matches_monte_carlo(self) -> str:
         """The entropy is the mean of minus the log-probability of draws."""
-        draws = self._draw_decisions()
-        return _check_means(-draws.log_prob, draws.distribution.entropy()[0], draws.mask)
+        distribution, _, log_prob = self._draw_decisions()
+        return self._check_means(-log_prob, distribution.entropy()[0])
 
     def kl_matches_monte_carlo(self) -> str:
         """The KL divergence from a second policy is the mean log-ratio of draws."""
-        draws = self._draw_decisions()
+        distribution, decisions, log_prob = self._draw_decisions()
         reference = self._decide_first(self.reference)
         # KL(p || q) is the mean of log p - log q over draws from p
-        ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(draws.log_prob, draws.decisions)])
-        return _check_means(ratio, draws.distribution.kl(reference)[0], draws.mask)
+        ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(log_prob, decisions)])
+        return self._check_means(ratio, distribution.kl(reference)[0])
 
     def probabilities_sum_to_one(self) -> str:
         """Probabilities add up to 1 (as importance weights of draws at temperature 1.5)."""
-        draws = self._draw_decisions(Sampling(temperature=1.5))
+        distribution, decisions, log_prob = self._draw_decisions(temperature=1.5)
         # the mean of p / p_warm over draws from p_warm is the sum of p over all decisions that p_warm can draw
-        log_p = torch.stack([draws.distribution.log_prob(d)[0] for d in draws.decisions])
-        weight = (log_p - draws.log_prob).exp()
-        return _check_means(weight, torch.ones_like(weight[0]), draws.mask)
+        log_p = torch.stack([distribution.log_prob(d)[0] for d in decisions])
+        weight = (log_p - log_prob).exp()
+        return self._check_means(weight, torch.ones_like(weight[0]))
 
     def _decide_first(self, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
         """Distributions of the first decision in the smallest scenario, for N equal rollouts [1, N, A]."""
@@ -433,10 +411,28 @@ class Rules(_Subject):
             context = policy.encode(batch)
             return policy.decide(context, policy.begin(context, num_rollouts, None, noise))
 
-    def _draw_decisions(self, sampling: Sampling = Sampling()) -> _Draws:  # noqa: B008
+    def _check_means(self, draws: Tensor, expected: Tensor) -> str:
+        """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A], or `_Broken` with the text."""
+        # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
+        mask = self.smallest_batch.agent_mask[0]
+        flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
+        error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
+        gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
+        return _check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
+
+    def _draw_decisions(self, temperature: float = 1.0) -> tuple[DecisionDistribution, list[Tensor], Tensor]:
+        """Many draws of the first decision of the smallest scenario.
+
+        Args:
+            temperature: Temperature of the draws; 1 draws from the untempered distribution.
+
+        Returns:
+            Distribution [1, N, A], K draws of it, and their log-probabilities [K, N, A] under the distribution that
+            was drawn from.
+        """
         if not self.is_random:
             raise _NotApplicable("decisions are deterministic (noise_size is 0)")
-        distribution = self._decide_first(self.policy)
+        distribution, sampling = self._decide_first(self.policy), Sampling(temperature=temperature)
         mask = self.smallest_batch.agent_mask[0]
         generator = torch.Generator().manual_seed(0)
         decisions = []
@@ -444,7 +440,7 @@ class Rules(_Subject):
             noise = torch.rand(1, 64, len(mask), self.policy.noise_size, generator=generator).to(mask.device)
             decisions.append(distribution.sample(sampling, noise))
         log_prob = torch.stack([distribution.log_prob(d, sampling)[0] for d in decisions])
-        return _Draws(distribution, decisions, log_prob, mask)
+        return distribution, decisions, log_prob
 
     # ---- rules: sampling and kinematics -----------------------------------------------------------------------------
 

@@ -27,23 +27,14 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
     """
     world = batch.to_world(rollouts.position).cpu().numpy()
     headings, heights = rollouts.heading.float().cpu().numpy(), batch.z[:, :, CURRENT_STEP].cpu().numpy()
-    files = []
-    for b, scenario in enumerate(batch.scenarios):
+    files = [folder / f"{scenario.scenario_id}.npz" for scenario in batch.scenarios]
+    for b, (file, scenario) in enumerate(zip(files, batch.scenarios)):
         indices = scenario.simulated_indices
         heading = headings[b, :, : len(indices)]  # [N, A, 80] without padding
-        write_atomically(
-            folder / f"{scenario.scenario_id}.npz",
-            partial(
-                _write_npz,
-                scenario_id=np.array(scenario.scenario_id),
-                object_ids=scenario.tracks.object_id[indices],
-                x=world[b, :, : len(indices), :, 0],
-                y=world[b, :, : len(indices), :, 1],
-                z=np.broadcast_to(heights[b, : len(indices), None], heading.shape),
-                heading=heading,
-            ),
-        )
-        files.append(folder / f"{scenario.scenario_id}.npz")
+        x, y = (world[b, :, : len(indices), :, axis] for axis in range(2))
+        z = np.broadcast_to(heights[b, : len(indices), None], heading.shape)
+        ids = {"scenario_id": np.array(scenario.scenario_id), "object_ids": scenario.tracks.object_id[indices]}
+        write_atomically(file, partial(_write_npz, **ids, x=x, y=y, z=z, heading=heading))
     return files
 
 

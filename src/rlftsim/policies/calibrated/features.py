@@ -104,28 +104,16 @@ def features_by_name(names: Sequence[str]) -> tuple[Feature, ...]:
 # ---- speed and direction of vehicles that move ----------------------------------------------------------------------
 
 
-@register_feature("speed_gap_under_2s", low=-1.5, high=1.5)
-def speed_gap_under_2s(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of speed, m/s, where the leader is less than 2 s ahead."""
-    return c.speed_change * c.where(c.is_moving & (c.time_gap < 2))
-
-
-@register_feature("speed_gap_2_to_4s", low=-1.5, high=1.5)
-def speed_gap_2_to_4s(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of speed, m/s, where the leader is 2 to 4 s ahead."""
-    return c.speed_change * c.where(c.is_moving & (c.time_gap >= 2) & (c.time_gap < 4))
-
-
-@register_feature("turn_to_lane_direction", low=-2.0, high=2.0)
-def turn_to_lane_direction(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of turn times the angle of the lane to the heading; positive = towards the lane's direction."""
-    return 10 * c.turn_change * c.of_pairs(c.lane_turn * c.is_moving)
-
-
-@register_feature("turn_to_lane_center", low=-2.0, high=2.0)
-def turn_to_lane_center(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of turn times the lateral offset of the lane's center; positive = towards the center."""
-    return 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)
+for _name, _limit, _compute in (
+    # change of speed, m/s, where the leader is less than 2 s ahead, or 2 to 4 s
+    ("speed_gap_under_2s", 1.5, lambda c: c.speed_change * c.where(c.is_moving & (c.time_gap < 2))),
+    ("speed_gap_2_to_4s", 1.5, lambda c: c.speed_change * c.where(c.is_moving & (c.time_gap >= 2) & (c.time_gap < 4))),
+    # change of turn times the angle of the lane to the heading; positive = towards the lane's direction
+    ("turn_to_lane_direction", 2.0, lambda c: 10 * c.turn_change * c.of_pairs(c.lane_turn * c.is_moving)),
+    # change of turn times the lateral offset of the lane's center; positive = towards the center
+    ("turn_to_lane_center", 2.0, lambda c: 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)),
+):
+    register_feature(_name, low=-_limit, high=_limit)(_compute)
 
 
 # ---- by speed: slow below 4 m/s, middle, fast from 9 m/s -------------------------------------------------------------
@@ -156,12 +144,7 @@ for _seconds in (0.5, 1.0):
     register_feature(f"edge_{_seconds:g}s", low=0.0, high=3.0)(
         lambda c, seconds=_seconds: c.road_edge(seconds) * c.where(c.is_vehicle)
     )
-
-
-@register_feature("edge_0.5s_walking_cycling", low=0.0, high=3.0)
-def edge_walking_cycling(c: Candidates) -> Float[Tensor, "P"]:
-    """Nearness of the road edge in half a second, of pedestrians and cyclists."""
-    return c.road_edge(0.5) * c.where(~c.is_vehicle)
+register_feature("edge_0.5s_walking_cycling", low=0.0, high=3.0)(lambda c: c.road_edge(0.5) * c.where(~c.is_vehicle))
 
 
 @dataclass(frozen=True, eq=False)
