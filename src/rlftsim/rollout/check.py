@@ -552,11 +552,8 @@ class Rules(_Subject):
                     dist, ref = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
                     statistics = compute_statistics(dist, decision, ref)
                 kl = expected.kl(self.score(self.batch, rollouts, reference))
-                gaps += [
-                    _compute_gap(statistics.log_prob, expected.log_prob(decision)),
-                    _compute_gap(statistics.kl, kl),
-                ]
-                gaps.append(_compute_gap(statistics.entropy, expected.entropy()))
+                values = (expected.log_prob(decision), kl, expected.entropy())
+                gaps += map(_compute_gap, (statistics.log_prob, statistics.kl, statistics.entropy), values)
         return _check_limit(max(gaps), SCORE_TOLERANCE)
 
     # ---- rules: scenarios -------------------------------------------------------------------------------------------

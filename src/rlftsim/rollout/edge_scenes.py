@@ -54,15 +54,10 @@ def _move_points(scenario: Scenario, transform: Callable[[np.ndarray], np.ndarra
 
 def without_future(scenario: Scenario) -> Scenario:
     """The same scenario as in a test split: tracks and lights end at the current step."""
-    tracks, lights, end = scenario.tracks, scenario.lights, CURRENT_STEP + 1
+    times, tracks, lights, end = scenario.timestamps_s, scenario.tracks, scenario.lights, CURRENT_STEP + 1
     cut = {name: getattr(tracks, name)[:, :end] for name in ("position", "heading", "velocity", "size", "valid")}
     history = {field.name: getattr(lights, field.name)[lights.step < end] for field in fields(lights)}
-    return replace(
-        scenario,
-        timestamps_s=scenario.timestamps_s[:end],
-        tracks=replace(tracks, **cut),
-        lights=LightStates(**history),
-    )
+    return replace(scenario, timestamps_s=times[:end], tracks=replace(tracks, **cut), lights=LightStates(**history))
 
 
 def place_on_grid(scenario: Scenario) -> Scenario:

@@ -138,9 +138,10 @@ class GoalEdgeEmbedding(nn.Embedding):
         return normalize(embedding(values, zeros)), normalize(embedding(values, goal))
 
 
-def build_goal_encoder(
-    encoding: GoalEncoding | None, dim: int, num_frequencies: int
-) -> GoalEmbedding | GoalEdgeEmbedding | None:
+GoalEncoder = GoalEmbedding | GoalEdgeEmbedding
+
+
+def build_goal_encoder(encoding: GoalEncoding | None, dim: int, num_frequencies: int) -> GoalEncoder | None:
     """Module of a goal encoding, with random weights; None for a goal-free model.
 
     Args:

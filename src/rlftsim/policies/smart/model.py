@@ -8,7 +8,7 @@ import math
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import TypeVar
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -35,9 +35,6 @@ from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
 from rlftsim.tokens.vocabulary import Vocabulary
 
 VOCABULARY = "vocabulary.safetensors"
-
-
-Model = TypeVar("Model", bound="SmartModel")
 
 
 class SmartModel(nn.Module):
@@ -95,7 +92,7 @@ class SmartModel(nn.Module):
         """True if goals have an effect."""
         return self.config.goal is not None
 
-    def with_goal_conditioning(self: Model, encoding: GoalEncoding, *, logit_bias: bool | None = None) -> Model:
+    def with_goal_conditioning(self, encoding: GoalEncoding, *, logit_bias: bool | None = None) -> Self:
         """Copy with goal-conditioning weights that have no effect yet; the model unchanged if conditioned in this way.
 
         Args:
@@ -119,7 +116,7 @@ class SmartModel(nn.Module):
         load_strictly(policy.network, {**self.network.state_dict(), **fresh}, source="the model to start from")
         return policy.train(self.training)
 
-    def with_guidance(self: Model, scale: float) -> Model:
+    def with_guidance(self, scale: float) -> Self:
         """Copy with a scaled goal logit bias: above 1 goals are followed more closely than was learned; at 1 the model.
 
         Raises:
@@ -154,7 +151,7 @@ class SmartModel(nn.Module):
         save_model(folder, self, asdict(self.config), card=card, weights=self.network.state_dict())
 
     @classmethod
-    def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
+    def from_pretrained(cls, folder: str | os.PathLike) -> Self:
         """Model of a model folder as written by `save_pretrained`, or of a run's folder, in training mode.
 
         Raises:
@@ -182,25 +179,21 @@ class SmartModel(nn.Module):
         return build_logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
 
     def _predict(
-        self,
-        scene: Scene,
-        features: Float[Tensor, "R E"],
-        token_class: Int64[Tensor, "B A"],
-        mask: Bool[Tensor, "B N A *L"],
+        self, scene: Scene, x: Float[Tensor, "R E"], token_class: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
-        scenario, _, agent, *_ = find_rows(mask, is_dense=len(features) == mask.numel())
+        scenario, _, agent, *_ = find_rows(mask, is_dense=len(x) == mask.numel())
         class_id = token_class[scenario, agent]  # [R]
         head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):
-            return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
+            return TokenDistribution(head(x, class_id).masked_fill(~exists[class_id], NEVER), mask)
         *first, last = head
         assert isinstance(last, nn.Linear)
-        hidden, weight = nn.Sequential(*first)(features[:, : self.config.dim]), last.weight
+        hidden, weight = nn.Sequential(*first)(x[:, : self.config.dim]), last.weight
         if scores is not None:
             assert scene.token_keys is not None
             # both terms of the logits in one product
-            last_phase = features[:, self.config.dim :]
+            last_phase = x[:, self.config.dim :]
             hidden = torch.cat([hidden, scores.queries(hidden, last_phase, class_id)], -1)
             weight = torch.cat([weight, scene.token_keys.keys], -1)
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)

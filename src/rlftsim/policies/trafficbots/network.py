@@ -90,12 +90,12 @@ class MapEncoder(nn.Module):
         attributes = torch.cat([v.expand(*shape, -1) for v in (map_type, node_index)], -1)  # [B, M, 20, 31]
         geometry = segment_features(relative_pose(scene.node_pose, scene.map_pose[..., None, :]))
         x = self.polyline(torch.cat([self.nodes(attributes), geometry], -1), node_mask)
+        poses, mask = scene.map_pose, scene.map_mask
         neighbors = find_neighbors(
-            scene.map_pose, scene.map_pose, scene.map_mask,
-            count=config.map_neighbors, radius_m=config.radius_m, size=config.dim,
-        )  # fmt: skip
+            poses, poses, mask, count=config.map_neighbors, radius_m=config.radius_m, size=config.dim
+        )
         for layer in self.layers:
-            x = layer(x, scene.map_mask, neighbors)
+            x = layer(x, mask, neighbors)
         return x
 
 

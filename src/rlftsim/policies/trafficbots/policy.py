@@ -273,10 +273,8 @@ class TrafficBotsPolicy(nn.Module):
         """True if the weights of such names are frozen alike, without dropout."""
         if type(model) is not type(self) or self.config != model.config or self.training or model.training:
             return False
-        weights, reference = (
-            [weight for name, weight in m.network.named_parameters() if is_shared(name)] for m in (self, model)
-        )
-        return are_frozen_alike(weights, reference)
+        networks = (self.network, model.network)
+        return are_frozen_alike(*([w for name, w in n.named_parameters() if is_shared(name)] for n in networks))
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
