@@ -6,6 +6,7 @@ A agents, B scenarios, N rollouts, D width, R selected elements, V tokens.
 import copy
 import math
 import os
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import Self
@@ -32,6 +33,7 @@ from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
+from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 
 VOCABULARY = "vocabulary.safetensors"
@@ -84,6 +86,28 @@ class SmartModel(nn.Module):
         if (self.config, self.vocabulary) != (model.config, model.vocabulary):
             return False
         return are_frozen_alike(self.network.scene_weights(), model.network.scene_weights())
+
+    def with_settings(self, config: SmartConfig, vocabulary: Vocabulary | None, keep: Collection[str]) -> Self:
+        """Model with other settings and the weights of this one, to be trained further.
+
+        Args:
+            config: Settings of the new model, with the same sizes.
+            vocabulary: Tokens in place of the model's, see `align_vocabulary`; None = no change.
+            keep: Classes that stay with the model's tokens.
+
+        Raises:
+            CheckpointError: The weights are of other sizes.
+            ConfigError: More tokens than the model can hold, or a separate head for each class.
+        """
+        if vocabulary is not None and self.config.head_per_class:
+            raise ConfigError(
+                "each class of this model has a head of its own, whose places other tokens cannot take: leave "
+                "--vocabulary out."
+            )
+        tokens = self.vocabulary if vocabulary is None else align_vocabulary(vocabulary, self.vocabulary, keep=keep)
+        model = type(self)(config, tokens)
+        load_strictly(model, self.state_dict(), source="the model to train further")
+        return model
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 

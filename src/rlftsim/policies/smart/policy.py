@@ -1,7 +1,7 @@
 """SMART as a policy: every agent chooses a motion token of half a second, sixteen times.
 
-The five methods of `rollout.policy.Policy` with their contexts and states, and pre-training; `SmartModel` has weights and
-files.
+The five methods of `rollout.policy.Policy`, with their contexts and states, and pre-training; `SmartModel` has weights
+and files.
 
 B scenarios, N rollouts, A agents, L decisions, K token steps, D width, R selected elements, V tokens.
 """
