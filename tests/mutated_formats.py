@@ -34,8 +34,7 @@ from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_file
 from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
 from rlftsim.policies.checkpoint import read_card
-from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk
-from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.config import smart_nano
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.recipes.settings import recipe_as_json
@@ -557,7 +556,7 @@ FORMATS: Mapping[str, Format] = {
         {"weights.safetensors": "safetensors", "tables.npz": "npz"},
         make_catk,
         import_catk("weights.safetensors"),
-        ("policies.smart.catk_checkpoint", "policies.smart.catk_vocabulary"),
+        ("policies.smart.catk_checkpoint",),
     ),
     "run": Format(
         {"run/config.json": "json", "run/metrics.jsonl": "jsonl"}, make_run, read_run, ("training.run_folder",)

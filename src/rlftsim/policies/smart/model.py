@@ -26,8 +26,8 @@ from rlftsim.policies.distributions import (
     TokenRows,
 )
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
+from rlftsim.policies.smart.embeddings import ClassHeads
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
-from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.network import Scene, SmartNetwork
 from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
 from rlftsim.rollout.rows import find_rows

@@ -28,11 +28,14 @@ from rlftsim.policies.smart.attention import (
 )
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.embeddings import (
+    ClassHeads,
+    ContinuationScores,
     FourierEmbedding,
     Grid,
     MlpEmbedding,
     MlpLayer,
     RelationEmbedding,
+    TokenKeys,
     initialize,
     normalize,
     tabulate,
@@ -45,7 +48,6 @@ from rlftsim.policies.smart.goal_conditioning import (
     build_goal_encoder,
     select_rows,
 )
-from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
 from rlftsim.policies.smart.neighbors import Poses, bound_neighbors, find_neighbors, group_rows, relative_pose
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import find_rows, place_rows
