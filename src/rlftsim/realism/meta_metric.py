@@ -169,7 +169,6 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     leave_one_out, single = (scores.repeat_interleave(repeat, -1) for scores in rmm[..., 1:].split(num_distinct, -1))
     if num_distinct * repeat == 1:
         leave_one_out = torch.full_like(leave_one_out, torch.nan)
-    meta_metric, kinematic, interactive, map_based = (_weigh(likelihoods[0], row) for row in weights)
     # 3. Reported beside the metric, for each rollout [*B, N].
     displacement = _mean_per_rollout(features.displacement_error, log, repeat)
     collision = _compute_rate(features.collision, log, repeat)
@@ -180,13 +179,10 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     num_staying = sum_over_agents(stays_on_road.to(torch.float32), log.agents.layout)
     light = _compute_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
-        scenario_ids=tuple(scene.scenario_id for scene in log.logs),
-        config=config,
-        likelihoods=likelihoods[0],
-        meta_metric=meta_metric,
-        kinematic=kinematic,
-        interactive=interactive,
-        map_based=map_based,
+        tuple(scene.scenario_id for scene in log.logs),
+        config,
+        likelihoods[0],
+        *(_weigh(likelihoods[0], row) for row in weights),  # the meta-metric, then the sub-scores
         average_displacement_error=displacement.mean(-1),
         min_average_displacement_error=displacement.amin(-1),
         collision_rate=collision.mean(-1),

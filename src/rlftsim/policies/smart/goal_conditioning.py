@@ -76,9 +76,6 @@ def select_rows(mask: Bool[Tensor, "R"]) -> Int64[Tensor, "g"]:
 class GoalEmbedding(FourierEmbedding):
     """`concat`: embedding of distance and bearing that joins an agent's continuous state."""
 
-    def __init__(self, dim: int, num_frequencies: int):
-        super().__init__(2, dim, num_frequencies)
-
     def zero_init(self) -> None:
         """Zero the last map: the embedding of any goal is zero."""
         for weight in self.out[-1].parameters():
@@ -117,9 +114,6 @@ class GoalEmbedding(FourierEmbedding):
 class GoalEdgeEmbedding(nn.Embedding):
     """`indication`: the embedding that is added to the relation to an agent's goal polyline."""
 
-    def __init__(self, dim: int):
-        super().__init__(1, dim)
-
     def zero_init(self) -> None:
         """Zero the embedding: the relation to the goal polyline is as to any other map token."""
         nn.init.zeros_(self.weight)
@@ -151,7 +145,7 @@ def build_goal_encoder(encoding: GoalEncoding | None, dim: int, num_frequencies:
     """
     if encoding is None:
         return None
-    return GoalEmbedding(dim, num_frequencies) if encoding == "concat" else GoalEdgeEmbedding(dim)
+    return GoalEmbedding(2, dim, num_frequencies) if encoding == "concat" else GoalEdgeEmbedding(1, dim)
 
 
 class GoalLogitBias(nn.Module):

@@ -6,7 +6,7 @@ Shapes: M map tokens, L light tokens, S logged steps. The rules are those of Tra
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 
@@ -134,7 +134,7 @@ def tokenize_map(scenario: Scenario, max_tokens: int | None = 1024) -> MapTokens
     """
     features, pose = scenario.map_features, ego_pose(scenario)
     stop_sign_lanes = set(features.topology.stop_sign_lanes[:, 1].tolist())
-    positions, directions, types, ids = [], [], [], []
+    rows = []
     for index, (feature_id, feature_type) in enumerate(zip(features.feature_id, features.feature_type)):
         token_type = _TOKEN_TYPES.get(MapFeatureType(feature_type))
         if token_type is None:  # a stop sign
@@ -148,12 +148,9 @@ def tokenize_map(scenario: Scenario, max_tokens: int | None = 1024) -> MapTokens
             lines = [features.polyline(index)[::2].astype(np.float64)]
         for line in lines:
             line = to_ego_frame(line, pose)
-            for segments in cut_line(len(line) - 1):
-                if len(segments) >= MIN_NODES:
-                    positions.append(line[segments])
-                    directions.append(line[segments + 1] - line[segments])
-                    types.append(int(token_type))
-                    ids.append(int(feature_id))
+            pieces = (segments for segments in cut_line(len(line) - 1) if len(segments) >= MIN_NODES)
+            rows += [(line[piece], line[piece + 1] - line[piece], int(token_type), int(feature_id)) for piece in pieces]
+    positions, directions, types, ids = zip(*rows) if rows else ((), (), (), ())
     counts = np.array([len(p) for p in positions], np.int64)
     mask = np.arange(NUM_NODES) < counts[:, None]  # [M, 20]
     types, ids = np.array(types, np.int64), np.array(ids, np.int64)
@@ -198,7 +195,7 @@ def tokenize_lights(scenario: Scenario, max_tokens: int | None = 1024, *, of_his
         of_history: True leaves out lights that were not observed up to the current step, as a simulation must.
     """
     lights, map_tokens = scenario.lights, tokenize_map(scenario, max_tokens)
-    tokens, observed, states = [], [], []
+    rows = []
     for lane in np.unique(lights.lane_id):
         is_of_lane = (lights.lane_id == lane) & (lights.step < scenario.num_steps)
         is_observed, state = np.zeros(scenario.num_steps, bool), np.full(scenario.num_steps, UNKNOWN_LIGHT)
@@ -206,17 +203,15 @@ def tokenize_lights(scenario: Scenario, max_tokens: int | None = 1024, *, of_his
         state[lights.step[is_of_lane]] = [_LIGHT_STATES[LightState(s)] for s in lights.state[is_of_lane]]
         if not is_observed[: HISTORY_STEPS if of_history else None].any():
             continue
-        for token in np.flatnonzero(map_tokens.feature_id == lane):
-            tokens.append(token)
-            observed.append(is_observed)
-            states.append(state)
+        rows += [(token, is_observed, state) for token in np.flatnonzero(map_tokens.feature_id == lane)]
+    tokens, observed, states = zip(*rows) if rows else ((), (), ())
     shape = (len(tokens), scenario.num_steps)
     return LightTokens(
         np.array(tokens, np.int64), np.array(observed, bool).reshape(shape), np.array(states, np.int64).reshape(shape)
     )
 
 
-def _pad_nodes(mask: Bool[np.ndarray, "M 20"], nodes: list[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:
+def _pad_nodes(mask: Bool[np.ndarray, "M 20"], nodes: Sequence[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:
     padded = np.zeros((*mask.shape, 3))
     padded[mask] = np.concatenate([np.zeros((0, 3)), *nodes])
     return padded
