@@ -255,7 +255,7 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
     is_valid = {name: weights[name].isfinite() if name in parameters else ~weights[name].isnan() for name in expected}
     broken = [name for name, valid in is_valid.items() if not valid.all()]
     if broken:
-        names = _join_first(broken, ", ")
+        names = join_first(broken, ", ")
         raise CheckpointError(f"{source}: weights are not finite ({names}): take an earlier checkpoint or train again.")
     module.load_state_dict(weights)
 
@@ -293,11 +293,17 @@ def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], 
         if dtype != model_dtype and not {dtype, model_dtype} <= _FLOATS:
             problems.append(f"{k} holds {dtype} instead of {model_dtype}")
     if problems:
-        text = printable(_join_first(problems, "; "))
+        text = printable(join_first(problems, "; "))
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {text}.")
 
 
-def _join_first(problems: list[str], separator: str) -> str:
+def join_first(problems: list[str], separator: str) -> str:
+    """The first few of some problems as a text, followed by an ellipsis where there are more.
+
+    Args:
+        problems: Problems in the order to be shown.
+        separator: Text between two problems.
+    """
     return separator.join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
 
 

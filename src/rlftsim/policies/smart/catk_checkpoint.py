@@ -24,7 +24,7 @@ from rlftsim.errors import CheckpointError, ConfigError, DataError, printable
 from rlftsim.jobs.arrays import read_npz, read_tensors
 from rlftsim.jobs.documents import first_line
 from rlftsim.jobs.files import save_tensors, write_atomically
-from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
+from rlftsim.policies.checkpoint import join_first, outline, strip_wrappers
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -263,9 +263,7 @@ def _plain(value: Any) -> Any:
 
 def catk_name(key: str) -> str:
     """The public code's name of a weight of this package."""
-    # the longest prefix, as "decoder.tokens.1" is also a prefix of "decoder.tokens.10"
-    submodules = (entry for entry in _SUBMODULES if key.startswith(entry[0] + "."))
-    prefix, catk_prefix, module_type = max(submodules, key=lambda entry: len(entry[0]))
+    prefix, catk_prefix, module_type = next(entry for entry in _SUBMODULES if key.startswith(entry[0] + "."))
     name = key[len(prefix) + 1 :]
     if module_type == _MLP:
         name = f"mlp.{name}"
@@ -450,6 +448,6 @@ def _translate(weights: dict[str, Tensor], expected: dict[str, Tensor], source: 
         if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
             problems.append(f"{second} differs from {first}, which must be the same")
     if problems:
-        listed = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {printable(listed)}.")
+        text = printable(join_first(problems, "; "))
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {text}.")
     return {key: weights[name] for name, key in keys.items()}
