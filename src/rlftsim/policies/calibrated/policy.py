@@ -106,7 +106,7 @@ def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedContext:
+class Context:
     """Context of the base, and the scene that features look at."""
 
     base: Any
@@ -114,7 +114,7 @@ class CalibratedContext:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedState:
+class State:
     """State of the base, and the agents' motion."""
 
     base: Any
@@ -198,13 +198,11 @@ class CalibratedPolicy(nn.Module):
 
     # ---- the policy interface -------------------------------------------------------------------------------------
 
-    def encode(self, scenarios: ScenarioBatch) -> CalibratedContext:
+    def encode(self, scenarios: ScenarioBatch) -> Context:
         """Context of the base, lanes and edges of the maps, and the current step."""
-        return CalibratedContext(self.base.encode(scenarios), build_scene(scenarios))
+        return Context(self.base.encode(scenarios), build_scene(scenarios))
 
-    def begin(
-        self, context: CalibratedContext, num_rollouts: int, goals: Goals | None, noise: Tensor
-    ) -> CalibratedState:
+    def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current step, N times.
 
         Args:
@@ -214,9 +212,9 @@ class CalibratedPolicy(nn.Module):
             noise: Uniform numbers for the base, `initial_noise_size` per agent.
         """
         base = self.base.begin(context.base, num_rollouts, goals, noise)
-        return CalibratedState(base, context.scene.begin(num_rollouts))
+        return State(base, context.scene.begin(num_rollouts))
 
-    def decide(self, context: CalibratedContext, state: CalibratedState) -> TiltedDistribution:
+    def decide(self, context: Context, state: State) -> TiltedDistribution:
         """Tilted distributions [B, N, A] of the next token.
 
         Args:
@@ -225,9 +223,7 @@ class CalibratedPolicy(nn.Module):
         """
         return self._tilt(context.scene, self.base.decide(context.base, state.base), state.traffic)
 
-    def advance(
-        self, context: CalibratedContext, state: CalibratedState, decision: Tensor, forced: AgentStates | None = None
-    ) -> CalibratedState:
+    def advance(self, context: Context, state: State, decision: Tensor, forced: AgentStates | None = None) -> State:
         """State after a decision.
 
         Args:
@@ -237,9 +233,9 @@ class CalibratedPolicy(nn.Module):
             forced: States [B, N, A, t] imposed from outside, as for the base.
         """
         base = self.base.advance(context.base, state.base, decision, forced)
-        return CalibratedState(base, state.traffic.advance(base.poses, self._seconds))
+        return State(base, state.traffic.advance(base.poses, self._seconds))
 
-    def score(self, context: CalibratedContext, rollouts: Rollouts) -> CategoricalDistribution:
+    def score(self, context: Context, rollouts: Rollouts) -> CategoricalDistribution:
         """Tilted distributions [B, N, A, L] along rollouts.
 
         Args:

@@ -25,10 +25,10 @@ from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.network import NUM_CLASSES, TrafficBotsNetwork, history_windows
 from rlftsim.policies.trafficbots.scene import PEDESTRIAN, VEHICLE, Scene, build_scene
 from rlftsim.policies.trafficbots.state import (
+    Context,
     Memo,
     Record,
-    TrafficBotsContext,
-    TrafficBotsState,
+    State,
     compute_imposed_states,
     join_history,
     max_action,
@@ -66,13 +66,13 @@ class TrafficBotsPolicy(nn.Module):
 
     # ---- the policy interface -------------------------------------------------------------------------------------
 
-    def encode(self, scenarios: ScenarioBatch) -> TrafficBotsContext:
+    def encode(self, scenarios: ScenarioBatch) -> Context:
         """Features of the map, and of the lights at all decisions."""
         return self.encode_scene(build_scene(scenarios, HISTORY_STEPS, self.config.max_map_tokens))
 
     def begin(
-        self, context: TrafficBotsContext, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A 17"]
-    ) -> TrafficBotsState:
+        self, context: Context, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A 17"]
+    ) -> State:
         """The current step, N times, with a personality and a destination for each agent.
 
         Args:
@@ -93,7 +93,7 @@ class TrafficBotsPolicy(nn.Module):
             personality = standard_normal(noise[..., :LATENT_SIZE])
         return self.start(context, torch.cat([personality, index], -1).to(log_prob.dtype))
 
-    def start(self, context: TrafficBotsContext, draws: Float[Tensor, "B N A 17"]) -> TrafficBotsState:
+    def start(self, context: Context, draws: Float[Tensor, "B N A 17"]) -> State:
         """The current step, with personalities and destinations that have been drawn.
 
         Args:
@@ -103,9 +103,9 @@ class TrafficBotsPolicy(nn.Module):
         personality, destination = draws[..., :LATENT_SIZE], draws[..., LATENT_SIZE].long()
         conditioning = self.network.conditioning(context.scene, context.map_features, personality, destination)
         traffic = start_traffic(context.scene, destination)
-        return TrafficBotsState(traffic, conditioning, draws, continues=torch.zeros_like(traffic.alive))
+        return State(traffic, conditioning, draws, continues=torch.zeros_like(traffic.alive))
 
-    def decide(self, context: TrafficBotsContext, state: TrafficBotsState) -> GaussianDistribution:
+    def decide(self, context: Context, state: State) -> GaussianDistribution:
         """Distributions [B, N, A] of the next action.
 
         Args:
@@ -119,12 +119,8 @@ class TrafficBotsPolicy(nn.Module):
         return self._distribution(context, mean, residual, state.continues, state.traffic.alive)
 
     def advance(
-        self,
-        context: TrafficBotsContext,
-        state: TrafficBotsState,
-        decision: Float[Tensor, "B N A 2"],
-        forced: AgentStates | None = None,
-    ) -> TrafficBotsState:
+        self, context: Context, state: State, decision: Float[Tensor, "B N A 2"], forced: AgentStates | None = None
+    ) -> State:
         """State after 0.1 s of the chosen actions.
 
         Args:
@@ -156,7 +152,7 @@ class TrafficBotsPolicy(nn.Module):
             memo=Memo(),
         )
 
-    def score(self, context: TrafficBotsContext, rollouts: Rollouts) -> GaussianDistribution:
+    def score(self, context: Context, rollouts: Rollouts) -> GaussianDistribution:
         """Distributions [B, N, A, T] along rollouts, in parallel over time.
 
         Args:
@@ -166,21 +162,21 @@ class TrafficBotsPolicy(nn.Module):
         replay = self._replay(context, rollouts)
         return self._score_states(context, replay, rollouts.decision, self._encode_agents(context, replay))
 
-    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> TrafficBotsContext:
+    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> Context:
         """`encode(scenarios)`, with map and lights taken over from a model with the same features of both.
 
         Args:
             scenarios: Scenarios that `context` was encoded from, in the same order.
             context: Context from any policy whose weights have not been changed since; None = nothing to take over.
         """
-        if not isinstance(context, TrafficBotsContext) or not self.shares_scene_features(context.model):
+        if not isinstance(context, Context) or not self.shares_scene_features(context.model):
             return self.encode(scenarios)
         agent_context = self.network.agents.context(context.scene, context.map_features, context.light_features)
         record = context.record if self.shares_agent_features(context.model) else None
         return replace(context, agent_context=agent_context, model=self, record=record)
 
     def score_with_reference(
-        self, context: TrafficBotsContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
+        self, context: Context, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[GaussianDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
@@ -204,7 +200,7 @@ class TrafficBotsPolicy(nn.Module):
             ref_dist = reference._score_states(ref_context, replay, rollouts.decision, features)
         return self._score_states(context, replay, rollouts.decision, features), ref_dist
 
-    def encode_scene(self, scene: Scene) -> TrafficBotsContext:
+    def encode_scene(self, scene: Scene) -> Context:
         """Features of the map, and of the lights at all decisions.
 
         Args:
@@ -215,7 +211,7 @@ class TrafficBotsPolicy(nn.Module):
         agent_context = self.network.agents.context(scene, map_features, light_features)
         trains_actions = any(weight.requires_grad for weight in self.network.actions.parameters())
         record = Record() if trains_actions and self.shares_agent_features(self) else None
-        return TrafficBotsContext(scene, map_features, light_features, agent_context, self, record)
+        return Context(scene, map_features, light_features, agent_context, self, record)
 
     def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
         """Features of the lights at all 80 decisions; each next state is the most likely state.
@@ -290,7 +286,7 @@ class TrafficBotsPolicy(nn.Module):
 
     # ---- states, means and distributions -----------------------------------------------------------------------------
 
-    def _replay(self, context: TrafficBotsContext, rollouts: Rollouts) -> list[TrafficBotsState]:
+    def _replay(self, context: Context, rollouts: Rollouts) -> list[State]:
         """States before each of T decisions, without the network."""
         assert rollouts.draws is not None
         states = [self.start(context, rollouts.draws)]
@@ -301,7 +297,7 @@ class TrafficBotsPolicy(nn.Module):
                 states.append(self.advance(context, state, rollouts.decision[:, :, :, index], forced))
         return states
 
-    def _encode_agents(self, context: TrafficBotsContext, states: list[TrafficBotsState]) -> Float[Tensor, "B T N A D"]:
+    def _encode_agents(self, context: Context, states: list[State]) -> Float[Tensor, "B T N A D"]:
         """Features of agents in each of T states."""
         traffic = [state.traffic for state in states]
         return self.network.features_over_time(
@@ -311,8 +307,8 @@ class TrafficBotsPolicy(nn.Module):
 
     def _score_states(
         self,
-        context: TrafficBotsContext,
-        states: list[TrafficBotsState],
+        context: Context,
+        states: list[State],
         decision: Float[Tensor, "B N A T 2"],
         features: Float[Tensor, "B T N A D"],
     ) -> GaussianDistribution:
@@ -322,7 +318,7 @@ class TrafficBotsPolicy(nn.Module):
         residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), (decision - mean)[:, :, :, :-1]], 3)
         return self._distribution(context, mean, residual, torch.stack([state.continues for state in states], 3), alive)
 
-    def _compute_mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
+    def _compute_mean(self, context: Context, state: State) -> Float[Tensor, "B N A 2"]:
         """Mean actions in a state, from the state's memo after the first call."""
         mean, scene = state.memo.mean, context.scene
         if mean is None:
@@ -336,7 +332,7 @@ class TrafficBotsPolicy(nn.Module):
 
     def _distribution(
         self,
-        context: TrafficBotsContext,
+        context: Context,
         mean: Float[Tensor, "B N A *T 2"],
         residual: Float[Tensor, "B N A *T 2"],
         continues: Bool[Tensor, "B N A *T"],

@@ -97,7 +97,7 @@ class Record:
     """Poses before each decision."""
     features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
 
-    def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
+    def add(self, state: "State", features: Float[Tensor, "B 1 N A D"]) -> None:
         """Add the next decision of the recorded rollouts; a first decision begins a new record.
 
         Args:
@@ -110,7 +110,7 @@ class Record:
             self.poses.append(state.traffic.windows.pose[..., -1, :].clone())  # a view would keep the window
             self.features.append(features)
 
-    def find_features(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
+    def find_features(self, states: Sequence["State"]) -> Float[Tensor, "B T N A D"] | None:
         """Features at T decisions; None unless the states are those of the record."""
         if self.draws is None or len(self.poses) != len(states) or not torch.equal(self.draws, states[0].draws):
             return None
@@ -119,7 +119,7 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
-class TrafficBotsContext:
+class Context:
     """Values of a scene that agents do not change."""
 
     scene: Scene
@@ -241,7 +241,7 @@ class Memo:
 
 
 @dataclass(frozen=True, eq=False)
-class TrafficBotsState:
+class State:
     """State of N simulations of each scene."""
 
     traffic: Traffic
@@ -253,7 +253,7 @@ class TrafficBotsState:
     num_decisions: int = 0
     poses: Float[Tensor, "B N A 1 3"] | None = None
     """Poses in the frame of the batch."""
-    previous: "TrafficBotsState | None" = None
+    previous: "State | None" = None
     """State before the last decision: the noise of a decision depends on the noise of the decision before."""
     decision: Float[Tensor, "B N A 2"] | None = None
     """The last decision."""
