@@ -125,7 +125,7 @@ def test_the_device_has_the_gradients_of_the_cpu():
 
 def test_a_table_that_stays_on_the_host_is_found(policy, batch, monkeypatch):
     table = torch.tensor([0, 0, 1, 2, 0])
-    monkeypatch.setattr("rlftsim.policies.smart.model.class_of_type", lambda object_type: table[object_type])
+    monkeypatch.setattr("rlftsim.policies.smart.network.class_of_type", lambda object_type: table[object_type])
     with on_device(), pytest.raises(RuntimeError, match=r"same device.*index"):
         policy.to(DEVICE).encode(batch.to(DEVICE))
 
