@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from rlftsim.evaluation.drive_results import format_drives
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 
 
 def drive(
@@ -57,7 +57,7 @@ def drive(
     results = driving.drive(config, out)
     print_wide(format_drives(*results))
     for scenario_id, reasons in results[0].missing.items():
-        print(f"  {scenario_id}: {'; '.join(f'no {name}, {reason}' for name, reason in reasons.items())}")
+        print_line(f"  {scenario_id}: {'; '.join(f'no {name}, {reason}' for name, reason in reasons.items())}")
     if film:
         print(driving.film(config, out))
     print(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")

@@ -10,7 +10,7 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.jobs.buckets import validate_folder
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -122,5 +122,5 @@ def print_evaluation(result: Evaluation, *, out: Path) -> None:
         raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
     print_wide(format_table(result))
     for skipped in result.skipped:
-        print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
+        print_line(f"  skipped {skipped.scenario_id}: {skipped.reason}")
     print(f"{out / result.name}.parquet")

@@ -16,7 +16,7 @@ from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
 from rlftsim.goals.maneuvers.lane_paths import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.progress import log, print_line, progress_bar
 from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -269,7 +269,7 @@ def _simulate_files(
     for exported in map(scenarios.by_id, ids if exporters else ()):
         states = read_rollouts(out, exported)
         for write in exporters:
-            print(write(exported, states, out))
+            print_line(write(exported, states, out))
     return paths
 
 

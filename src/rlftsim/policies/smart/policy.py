@@ -26,7 +26,7 @@ from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.tokens.agent_tokens import HISTORY_TOKENS
+from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, restart_at_log
 from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_type
 
 
@@ -36,7 +36,7 @@ class SmartContext:
 
     scene: Scene
     history: TokenSteps
-    """The two history tokens of a single rollout. The last ends at the current step, near the logged position."""
+    """The two history tokens of a single rollout. The last ends at the current step, near the logged pose or at it."""
     view: View
     """Of the history."""
     past: Past
@@ -124,9 +124,9 @@ class SmartPolicy(SmartModel):
 
     def encode(self, scenarios: ScenarioBatch) -> SmartContext:
         """Map features, history tokens and decoder features, for goal-free agents."""
-        tokens = self._tokenize(scenarios)
+        tokens = restart_at_log(self._tokenize(scenarios), scenarios, self.vocabulary)
         scene = self._build_scene(scenarios)
-        history = self._logged_steps(tokens, slice(0, HISTORY_TOKENS))
+        history = self._logged_steps(tokens, slice(HISTORY_TOKENS))
         view = self.network.decoder.look(scene, history, None)
         rows, past = self.network.decoder(scene, history, None, view)
         return SmartContext(
