@@ -31,7 +31,7 @@ from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_t
 
 
 @dataclass(frozen=True, eq=False)
-class SmartContext:
+class Context:
     """Features and geometry that do not depend on the agents' decisions, computed once per scenario."""
 
     scene: Scene
@@ -72,7 +72,7 @@ class DecoderCache:
 
 
 @dataclass(frozen=True, eq=False)
-class SmartState:
+class State:
     """Running simulations.
 
     Steps that have not been through the decoder wait in `pending`, and go through the decoder at most once.
@@ -122,14 +122,14 @@ class SmartPolicy(SmartModel):
         goals = "follows goals" if self.is_goal_conditioned else "follows no goals"
         return f"{type(self).__name__}({sum(weight.numel() for weight in self.parameters()):,} weights, {goals})"
 
-    def encode(self, scenarios: ScenarioBatch) -> SmartContext:
+    def encode(self, scenarios: ScenarioBatch) -> Context:
         """Map features, history tokens and decoder features, for goal-free agents."""
         tokens = restart_at_log(self._tokenize(scenarios), scenarios, self.vocabulary)
         scene = self._build_scene(scenarios)
         history = self._logged_steps(tokens, slice(HISTORY_TOKENS))
         view = self.network.decoder.look(scene, history, None)
         rows, past = self.network.decoder(scene, history, None, view)
-        return SmartContext(
+        return Context(
             scene=scene,
             history=history,
             view=view,
@@ -141,7 +141,7 @@ class SmartPolicy(SmartModel):
             model=self,
         )
 
-    def begin(self, context: SmartContext, num_rollouts: int, goals: Goals | None, noise: Tensor) -> SmartState:
+    def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current step, N times, without copies of the history.
 
         Args:
@@ -153,9 +153,9 @@ class SmartPolicy(SmartModel):
         current = context.history.last.repeat(num_rollouts)
         position, heading = current.position[:, :, :, 0], current.heading[:, :, :, 0]
         if goals is None or not self.is_goal_conditioned or not goals.any:
-            return SmartState(position, heading, context.past.repeat(num_rollouts), pending=None)
+            return State(position, heading, context.past.repeat(num_rollouts), pending=None)
         # the context is goal-free: the current step goes through the decoder again, with goals; earlier steps do not
-        return SmartState(
+        return State(
             position,
             heading,
             context.past.without_last_step().repeat(num_rollouts),
@@ -163,7 +163,7 @@ class SmartPolicy(SmartModel):
             goals=encode_goals(goals, mask_positions(context.scene.map_mask, context.scene.map_position)),
         )
 
-    def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
+    def decide(self, context: Context, state: State) -> TokenDistribution:
         """Distributions [B, N, A] of the next token of every agent.
 
         Args:
@@ -179,12 +179,8 @@ class SmartPolicy(SmartModel):
         return TokenDistribution(dist.logits, mask)
 
     def advance(
-        self,
-        context: SmartContext,
-        state: SmartState,
-        decision: Int64[Tensor, "B N A"],
-        forced: AgentStates | None = None,
-    ) -> SmartState:
+        self, context: Context, state: State, decision: Int64[Tensor, "B N A"], forced: AgentStates | None = None
+    ) -> State:
         """State after the chosen token's five poses. The decoder is not run, the step waits in `pending`.
 
         Args:
@@ -212,9 +208,9 @@ class SmartPolicy(SmartModel):
         elif state.pending is not None:
             pending = state.pending.append(block)
         num_decisions = state.num_decisions + 1
-        return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
+        return State(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
-    def score(self, context: SmartContext, rollouts: Rollouts) -> CategoricalDistribution:
+    def score(self, context: Context, rollouts: Rollouts) -> CategoricalDistribution:
         """Distributions [B, N, A, L] along rollouts: a single pass of the decoder over all steps.
 
         Args:
@@ -223,7 +219,7 @@ class SmartPolicy(SmartModel):
         """
         return self._score(context, *self._replay(context, rollouts))
 
-    def _replay(self, context: SmartContext, rollouts: Rollouts) -> tuple[SmartState, View | None]:
+    def _replay(self, context: Context, rollouts: Rollouts) -> tuple[State, View | None]:
         """State before the last decision of rollouts, and a view of the steps, all pending; None = there are none.
 
         The decoder is not run: but for the past, no value depends on weights that fine-tuning trains.
@@ -237,7 +233,7 @@ class SmartPolicy(SmartModel):
         steps = state.pending
         return state, None if steps is None else self.network.decoder.look(context.scene, steps, state.past)
 
-    def _score(self, context: SmartContext, state: SmartState, view: View | None) -> CategoricalDistribution:
+    def _score(self, context: Context, state: State, view: View | None) -> CategoricalDistribution:
         """Distributions along rollouts that have been replayed, by this model or by a model that sees alike."""
         # 1. features [B, N, A, L, D]: of the current step, from the context for goal-free agents, and of later steps
         blocks = []
@@ -259,21 +255,21 @@ class SmartPolicy(SmartModel):
 
     # ---- passes that share scenes and views -------------------------------------------------------------------------
 
-    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> SmartContext:
+    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> Context:
         """`encode(scenarios)`, with scene and history taken over from a context of a model that sees alike.
 
         Args:
             scenarios: Scenarios that `context` was encoded from, in the same order.
             context: Context of any policy with weights that have not changed since.
         """
-        if not isinstance(context, SmartContext) or not self.sees_as(context.model):
+        if not isinstance(context, Context) or not self.sees_as(context.model):
             return self.encode(scenarios)
         rows, past = self.network.decoder(context.scene, context.history, None, context.view)
         features = place_rows(rows, context.history.valid)[:, 0, :, -1]
         return replace(context, past=past, features=features, model=self)
 
     def score_with_reference(
-        self, context: SmartContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
+        self, context: Context, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[CategoricalDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
@@ -289,7 +285,7 @@ class SmartPolicy(SmartModel):
         replay = self._replay(context, rollouts)
         dist = self._score(context, *replay)
         with torch.no_grad():
-            is_shared = isinstance(ref_context, SmartContext) and ref_context.scene is context.scene
+            is_shared = isinstance(ref_context, Context) and ref_context.scene is context.scene
             if is_shared and ref_rollouts is rollouts:
                 return dist, reference._score(ref_context, *replay)
             return dist, reference.score(ref_context, ref_rollouts)
@@ -322,7 +318,7 @@ class SmartPolicy(SmartModel):
 
     # ---- passes of the decoder and the head -----------------------------------------------------------------------
 
-    def _compute_features(self, context: SmartContext, state: SmartState) -> Float[Tensor, "B N A D"]:
+    def _compute_features(self, context: Context, state: State) -> Float[Tensor, "B N A D"]:
         """Decoder features at the state's last step, from the cache after the first call."""
         cache = state.cache
         if cache.features is None:
@@ -339,8 +335,8 @@ class SmartPolicy(SmartModel):
 
     def _build_distribution(
         self,
-        context: SmartContext,
-        state: SmartState,
+        context: Context,
+        state: State,
         features: Float[Tensor, "R D"],
         mask: Bool[Tensor, "*batch"],
         poses: Poses | None,
