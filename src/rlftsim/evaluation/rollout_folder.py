@@ -20,10 +20,10 @@ from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner
 from rlftsim.realism import SimulatedStates
-from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 

@@ -19,7 +19,6 @@ from torch import nn
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.policies import SHIPPED_POLICIES
-from rlftsim.policies.checkpoint import find_model as find_model
 from rlftsim.policies.checkpoint import find_similar_model, read_model
 from rlftsim.rollout.policy import LoadablePolicy, Policy
 

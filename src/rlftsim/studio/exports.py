@@ -6,7 +6,7 @@ from pathlib import Path
 from rlftsim.goals.goals_file import parse_goals, write_goals
 from rlftsim.jobs.files import errors_name, write_atomically, write_text
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.studio import Refusal

@@ -17,9 +17,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, check_positive, check_types, given
-from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import read_goal_file, write_goal_file
-from rlftsim.goals.types import Points
+from rlftsim.goals.types import Points, logged_goals
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items

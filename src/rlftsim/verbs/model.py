@@ -13,8 +13,7 @@ from rlftsim.jobs.progress import print_line
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
-from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
-from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import append_cards
 from rlftsim.recipes.docstrings import summarize_docstring

@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.evaluate import check_jobs, frozen_copy
 from rlftsim.evaluation.exporters import exporter_by_name
 from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
-from rlftsim.goals.maneuvers.reach import HORIZON_S
+from rlftsim.goals.maneuvers.lane_paths import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.progress import log, print_line, progress_bar
