@@ -136,7 +136,8 @@ def join_chunks(chunks: list[Rollouts]) -> Rollouts:
     """Rollouts of all chunks of a variant on the CPU; goals and draws are left out."""
 
     names = ("position", "heading", "decision", "decision_mask", "log_prob")
-    return Rollouts(**{name: torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu() for name in names})
+    values: dict[str, Any] = {name: torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu() for name in names}
+    return Rollouts(**values)
 
 
 class Worker:
