@@ -1,4 +1,5 @@
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 import rlftsim
 from rlftsim.errors import CheckpointError, DataError
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import check_columns, map_arrow, read_parquet, read_parquet_metadata
 
 PACKAGE = Path(rlftsim.__file__).parent
@@ -92,45 +94,75 @@ def repeat_text(num_rows, num_bytes):
     return pa.DictionaryArray.from_arrays(pa.array(np.zeros(num_rows, np.int32)), text)
 
 
-@pytest.mark.parametrize(
-    ("column", "settings"),
-    [
-        (repeat_text(20_000, 1_000_000), {"dictionary_pagesize_limit": 1 << 30, "store_schema": False}),
-        (repeat_text(20_000, 1_000_000), {"dictionary_pagesize_limit": 1 << 30, "data_page_version": "2.0"}),
-        (pa.ListArray.from_arrays(pa.array([0, 20_000], pa.int32()), repeat_text(20_000, 1_000_000)), {}),
-        (pa.ListArray.from_arrays(pa.array([0, 30_000_000], pa.int32()), pa.array(np.zeros(30_000_000))), {}),
-        (["y" * 600_000_000], {"use_dictionary": False, "write_statistics": False}),
-        (
-            [f"{'z' * 100_000}{number}" for number in range(6_000)],
-            {"use_dictionary": False, "column_encoding": {"a": "DELTA_BYTE_ARRAY"}},
-        ),
-    ],
-    ids=["texts", "texts-v2", "texts-in-a-list", "a-long-list", "a-long-text", "differences"],
-)  # fmt: skip
-def test_a_small_file_that_unfolds_to_more_than_memory_holds_is_refused(column, settings, tmp_path):
-    pq.write_table(pa.table({"a": column}), tmp_path / "a.parquet", compression="zstd", **settings)
-    before = pa.default_memory_pool().bytes_allocated()
-    with pytest.raises(DataError, match=r"a\.parquet: cannot be read \(it unfolds to .* bytes or more from \d+\): get"):
-        read_parquet(tmp_path / "a.parquet", "get it again")
-    assert pa.default_memory_pool().bytes_allocated() == before
+BOMBS = {
+    "texts": (lambda: repeat_text(20_000, 1_000_000), {"dictionary_pagesize_limit": 1 << 30}),
+    "texts-v2": (
+        lambda: repeat_text(20_000, 1_000_000),
+        {"dictionary_pagesize_limit": 1 << 30, "data_page_version": "2.0"},
+    ),
+    "texts-in-a-list": (lambda: in_a_list(repeat_text(20_000, 1_000_000)), {}),
+    "a-long-list": (lambda: in_a_list(pa.array(np.zeros(150_000_000))), {}),
+    "a-long-text": (lambda: ["y" * 1_500_000_000], {"use_dictionary": False, "write_statistics": False}),
+    "differences": (
+        lambda: [f"{'z' * 100_000}{number}" for number in range(12_000)],
+        {"use_dictionary": False, "column_encoding": {"a": "DELTA_BYTE_ARRAY"}},
+    ),
+}
 
 
-def test_texts_that_are_repeated_within_reason_are_read(tmp_path, monkeypatch):
+def in_a_list(values):
+    return pa.ListArray.from_arrays(pa.array([0, len(values)], pa.int32()), values)
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_small_file_that_unfolds_to_more_than_memory_holds_is_refused(name, tmp_path):
+    make_column, settings = BOMBS[name]
+    table = pa.table({"a": make_column()})
+    pq.write_table(table, tmp_path / "a.parquet", compression="zstd", store_schema=False, **settings)
+    command = [sys.executable, "-c", READ_BOMB, str(tmp_path / "a.parquet")]
+    message, peak = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    assert message.endswith("a.parquet: cannot be read (it unfolds to more than its size explains): get it again.")
+    assert int(peak) < 3 << 29
+
+
+READ_BOMB = """
+import resource, sys
+from rlftsim.errors import DataError
+from rlftsim.jobs.tables import read_parquet
+
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, resource.getrlimit(resource.RLIMIT_AS)
+try:
+    read_parquet(sys.argv[1], "get it again")
+except DataError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before[0]) << 10)
+assert resource.getrlimit(resource.RLIMIT_AS) == before[1]
+"""
+
+
+def test_a_named_pipe_is_refused_where_a_file_is_read(tmp_path):
+    os.mkfifo(tmp_path / "a.parquet")
+    for read in (read_parquet, map_arrow, read_json):
+        with pytest.raises(DataError, match="a pipe, not a file"):
+            read(tmp_path / "a.parquet", "write it again")
+    assert read_parquet_metadata(tmp_path / "a.parquet") == {}
+
+
+def test_texts_that_are_repeated_within_reason_are_read(tmp_path):
     names = [f"{'name' * 20}-{number % 3000}" for number in range(200_000)]
     table = pa.table({"by dictionary": names, "by differences": sorted(names), "in a list": [[name] for name in names]})
     pq.write_table(
         table, tmp_path / "a.parquet", use_dictionary=["by dictionary", "in a list.list.element"],
         column_encoding={"by differences": "DELTA_BYTE_ARRAY"},
     )  # fmt: skip
-    monkeypatch.setattr("rlftsim.jobs.tables.MAX_BYTES", 80_000_000)
     assert read_parquet(tmp_path / "a.parquet", "get it again").equals(table)
 
 
 def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tmp_path, monkeypatch):
-    monkeypatch.setattr("rlftsim.jobs.tables.MAX_BYTES", 1000)
+    monkeypatch.setattr("rlftsim.jobs.tables.MAX_VALUES", 1000)
     monkeypatch.setattr(pq.ParquetFile, "read", lambda *_: pytest.fail("it was read"))
     pq.write_table(pa.table({"a": [0] * 1_000_000}), tmp_path / "a.parquet")
-    with pytest.raises(DataError, match=r"unfolds to 2\.4e\+07 bytes or more from \d+"):
+    with pytest.raises(DataError, match=r"announces 1e\+06 values in \d+ bytes"):
         read_parquet(tmp_path / "a.parquet", "write it again")
 
 

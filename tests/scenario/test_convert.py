@@ -111,7 +111,7 @@ def test_bad_records_are_skipped_and_reported(source, tmp_path, make_message, ma
     (source / "training" / "empty.tfrecord").touch()
     report = run(source, tmp_path / "data")
     assert report.converted == 5
-    assert [(s.file, s.record, s.cause.split(":")[0]) for s in report.skipped] == [
+    assert [(s.file, s.record, s.cause.removeprefix("scenario bad: ").split(":")[0]) for s in report.skipped] == [
         ("training/empty.tfrecord", 0, "the file is empty"),
         (
             "training/training.tfrecord-00001-of-00002",

@@ -3,6 +3,7 @@ tables."""
 
 import logging
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ from rlftsim.errors import printable
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200
-"""Width of a table that is not printed on a terminal, in characters."""
+"""Width of a table that is not printed on a terminal, in characters, unless the variable COLUMNS says another one."""
 
 
 class _StandardError(logging.StreamHandler):  # type: ignore[type-arg]
@@ -72,8 +73,9 @@ def print_line(text: object, file: Any = None) -> None:
 
 
 def print_wide(*tables: object) -> None:
-    """Print tables as wide as the terminal, or `FILE_WIDTH` wide in files. Brackets in texts are not markup."""
-    width = None if Console().is_terminal else FILE_WIDTH
+    """Print tables as wide as the terminal or as COLUMNS says, else `FILE_WIDTH` wide in files. Brackets in texts are
+    not markup."""
+    width = None if Console().is_terminal or "COLUMNS" in os.environ else FILE_WIDTH
     console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
         console.print(table)

@@ -28,8 +28,7 @@ from rlftsim.realism.interactive import PlanarAgents, compute_distance_to_neares
 from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge, join_road_edges
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation, join_signals
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario, cached_on_scenario
 
 MissingMap = Literal["error", "neutral"]
 

@@ -38,9 +38,10 @@ from rlftsim.scenario.dataset import (
     write_json,
 )
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
-from rlftsim.scenario.source import DataSource, Unit, read_unit, units_of_urls
+from rlftsim.scenario.source import BytesRead, DataSource, Tally, Unit, read_unit, units_of_urls
 from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, find_source
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
+from rlftsim.scenario.types import Scenario
 
 _INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on."
 _RECEIPTS = "*.arrow.json"
@@ -299,7 +300,7 @@ def _convert_unit(
     Args:
         task: Unit of the source, the shard to make, and the finished shard of that name.
         advance: Callback for the number of bytes that were read or need not be.
-        is_stopped: True once the shard is not needed any more; asked after each scenario.
+        is_stopped: True once the shard is not needed any more; asked after each item.
         source: Reader of the unit, with the options of the command.
 
     Raises:
@@ -333,28 +334,23 @@ def _convert_unit(
     # 2. Read and write record by record, so that memory does not grow with the file.
     skipped: list[SkippedRecord] = []
     tallies: Counter[str] = Counter()
-    bytes_left = size
-
-    def count(num_bytes: int) -> None:
-        nonlocal bytes_left
-        bytes_left -= num_bytes
-        advance(num_bytes)
-
+    num_read = 0
     with ShardWriter(task.folder / task.shard) as writer:
-        scenarios = read_unit(
-            source,
-            task.unit,
-            on_error=task.on_error,
-            report=skipped.append,
-            advance=count,
-            tally=lambda tally: tallies.update({tally.event: tally.count}),
-        )
-        for record, scenario in scenarios:
-            writer.add(scenario, task.split, record)
+        for record, item in read_unit(source, task.unit, on_error=task.on_error):
+            match item:
+                case Scenario():
+                    writer.add(item, task.split, record)
+                case SkippedRecord():
+                    skipped.append(item)
+                case BytesRead():
+                    advance(item)
+                    num_read += item
+                case Tally():
+                    tallies[item.event] += item.count
             if is_stopped():
                 raise _Stopped
     # bytes between records, and all of them for a source that does not count
-    advance(bytes_left)
+    advance(size - num_read)
 
     # 3. Leave a receipt: from now on the shard counts as finished.
     if len(task.unit.files) == 1:  # the same bytes wherever the sources lie

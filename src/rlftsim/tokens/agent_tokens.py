@@ -12,8 +12,7 @@ from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.scenario.batch import Frame, ScenarioBatch, collate
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario, cached_on_scenario
 from rlftsim.tokens import catk_compat as catk_ops
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, box_of_class, class_of_type
 

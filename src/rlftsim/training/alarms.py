@@ -28,6 +28,8 @@ class AlarmConfig:
     """Rise of the fraction of evaluated agents that run a red light."""
     speed_drift_mps: float = 1.0
     """Change, either way, of the mean speed against that of the log at the same steps."""
+    stop: bool = False
+    """The run ends with the update at which an alarm is raised; False = it goes on with a warning."""
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -9,8 +9,8 @@ from rich.table import Table
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.buckets import is_url
 from rlftsim.jobs.progress import print_line, print_wide
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
-from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
 
 

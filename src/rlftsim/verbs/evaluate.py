@@ -15,9 +15,8 @@ from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Sampling
-from rlftsim.scenario.any_form import to_scenarios
-from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
 from rlftsim.verbs.inputs import to_policy, to_sampling
 

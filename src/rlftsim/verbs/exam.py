@@ -13,7 +13,7 @@ from rlftsim.experiments.ledger import Ledger
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import find_device
-from rlftsim.scenario.open import SYNTHETIC
+from rlftsim.scenario.dataset import SYNTHETIC
 from rlftsim.verbs.arguments import Device
 
 

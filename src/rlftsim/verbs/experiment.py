@@ -14,7 +14,7 @@ from rlftsim.jobs.progress import log, print_line, print_wide
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.base import Recipe
-from rlftsim.scenario.open import SYNTHETIC, dataset_folder
+from rlftsim.scenario.dataset import SYNTHETIC, dataset_folder
 from rlftsim.verbs.arguments import Device, Processes, RecipeOption
 from rlftsim.verbs.inputs import to_recipe
 

@@ -14,8 +14,8 @@ from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_line, print_wide
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_membership, dataset_folder
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
+from rlftsim.scenario.open import check_membership
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 from rlftsim.viewer.figure import check_picture_path
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals

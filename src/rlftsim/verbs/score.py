@@ -18,8 +18,7 @@ from rlftsim.realism import score as score_scenario
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.verbs.arguments import Data, File, ScoreMetric, Simulated
 from rlftsim.verbs.inputs import to_batch

@@ -24,10 +24,9 @@ from rlftsim.rollout.policy import Policy, Sampling, get_device, is_goal_conditi
 from rlftsim.rollout.simulate import check_sampling
 from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.rollout.types import RolloutProvenance, Rollouts
-from rlftsim.scenario.any_form import to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_membership, open_dataset
+from rlftsim.scenario.open import check_membership, open_dataset, to_scenarios
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goal_outcomes import read_rollouts, report_outcomes

@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import MapFeatureType, Scenario
+from rlftsim.scenario.types import MapFeatureType, Scenario, cached_on_scenario
 
 FORBIDDEN = (
     MapFeatureType.LINE_SOLID_DOUBLE_WHITE,

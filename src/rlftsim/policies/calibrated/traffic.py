@@ -14,9 +14,8 @@ from torch import Tensor
 
 from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
-from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.polylines import arc_length, resample_to
-from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, Scenario, cached_on_scenario
 from rlftsim.tokens.vocabulary import class_of_type
 
 SEGMENT_LENGTH_M = 5.0

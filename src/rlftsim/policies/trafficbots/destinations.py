@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float64, Int64
 from rlftsim.policies.trafficbots.map_tokens import VEHICLE_LANES, MapTokens, MapTokenType, tokenize_map
 from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.lane_graph import lane_graph
-from rlftsim.scenario.types import TOTAL_STEPS, Scenario
+from rlftsim.scenario.types import TOTAL_STEPS, Scenario, cached_on_scenario
 from rlftsim.tokens.vocabulary import class_of_type
 
 VEHICLE, PEDESTRIAN, CYCLIST = range(3)

@@ -13,8 +13,7 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightState, MapFeatureType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightState, MapFeatureType, Scenario, cached_on_scenario
 
 NUM_NODES = 20
 """Largest number of nodes (segments) of a token."""

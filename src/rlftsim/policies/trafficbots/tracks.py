@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from rlftsim.policies.trafficbots.map_tokens import ego_pose, to_ego_frame
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import STEP_S, Scenario
+from rlftsim.scenario.types import STEP_S, Scenario, cached_on_scenario
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from rlftsim.scenario.dataset import (
     read_manifest,
     write_index_and_manifest,
 )
-from rlftsim.scenario.shards import ShardReader, ShardWriter
+from rlftsim.scenario.shards import ShardReader, ShardWriter, check_scenario
 from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_scenarios
 from rlftsim.scenario.synthetic.world import simulate_world
@@ -206,5 +206,6 @@ def _write_shard(folder: Path, task: NetworkTask, advance: Advance, is_stopped: 
         return
     with ShardWriter(folder / task.shard_name) as writer:
         for scenario in generate_scenarios(task):
+            check_scenario(scenario)
             writer.add(scenario, task.split)
     advance(task.num_scenarios)
