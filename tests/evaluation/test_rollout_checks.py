@@ -97,10 +97,11 @@ def test_what_no_road_user_does_is_told(warnings_of, axis, change, text):
 
 @pytest.mark.parametrize("change", [torch.full((80,), 1.5), torch.arange(80.0).clip(max=8) / 5])
 def test_headings_of_a_minority_of_rollouts_are_no_doubt_about_the_scenario(warnings_of, change):
-    states = logged_states(SCENARIO, num_rollouts=8)
+    log = logged_states(SCENARIO, num_rollouts=1)
+    x, y, z, heading = (values.repeat(8, 1, 1) for values in (log.x, log.y, log.z, log.heading))
     for count, is_told in ((3, False), (5, True)):
-        heading = states.heading + (torch.arange(8) < count)[:, None, None] * change
-        assert bool(warnings_of(replace(states, heading=heading))) == is_told
+        turned = heading + (torch.arange(8) < count)[:, None, None] * change
+        assert bool(warnings_of(SimulatedStates(log.object_id, x, y, z, turned))) == is_told
 
 
 def test_files_with_agents_and_rollouts_exchanged_are_scored_with_a_warning(tmp_path, capsys):
