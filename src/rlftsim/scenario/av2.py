@@ -27,6 +27,7 @@ from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
     MEDIAN_SIZE_M,
+    OTHER_SIZE_M,
     STEP_S,
     LightStates,
     ObjectType,
@@ -61,7 +62,7 @@ SIZES_M = {
     "pedestrian": MEDIAN_SIZE_M[ObjectType.PEDESTRIAN],
     "cyclist": MEDIAN_SIZE_M[ObjectType.CYCLIST],
     "motorcyclist": (2.1, 0.9, 1.7),
-    UNNAMED: MEDIAN_SIZE_M[ObjectType.OTHER],
+    UNNAMED: OTHER_SIZE_M,
     EGO: (4.87, 1.85, 1.48),
 }
 """Length, width and height where no file of sizes is given; the ego has the size of the recording vehicles."""

@@ -32,6 +32,7 @@ from rlftsim.scenario.types import (
     HISTORY_STEPS,
     LANE_TYPES,
     MEDIAN_SIZE_M,
+    OTHER_SIZE_M,
     POLYGON_TYPES,
     ROAD_EDGE_TYPES,
     STEP_S,
@@ -236,7 +237,7 @@ def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures
     starts = np.flatnonzero(~is_same_object)
     has_size = all(name in rows for name in SIZE_COLUMNS)
     types = object_type[starts]
-    guesses = np.array([MEDIAN_SIZE_M[ObjectType(int(k))] for k in types]).reshape(-1, 3)
+    guesses = np.array([MEDIAN_SIZE_M.get(ObjectType(int(k)), OTHER_SIZE_M) for k in types]).reshape(-1, 3)
     shape = (len(starts), num_steps)
     states, size, valid = np.zeros((*shape, 6)), np.zeros((*shape, 3)), np.zeros(shape, bool)
     names = [name for name in ("x", "y", "heading", "vx", "vy", "z") if name in rows]

@@ -48,10 +48,10 @@ MEDIAN_SIZE_M = {
     ObjectType.VEHICLE: (4.61, 2.06, 1.59),
     ObjectType.PEDESTRIAN: (0.88, 0.84, 1.70),
     ObjectType.CYCLIST: (1.84, 0.84, 1.77),
-    ObjectType.OTHER: (1.0, 1.0, 1.0),
-    ObjectType.UNSET: (1.0, 1.0, 1.0),
 }
 """Length, width and height where a log has none: medians of WOMD (18 631 vehicles, 2 288 pedestrians, 127 cyclists)."""
+OTHER_SIZE_M = (1.0, 1.0, 1.0)
+"""Length, width and height of objects of further types."""
 
 
 class MapFeatureType(IntEnum):

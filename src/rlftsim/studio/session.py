@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable
 from functools import lru_cache
+from operator import eq, ge, gt, le, lt, ne
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +43,7 @@ FIELDS = {
 MODEL_FIELDS = ("name", "source", "fingerprint", "takes_goals", "can_guide", "note")
 """Fields of `Model` that the page gets."""
 _TERM = re.compile(r"^(\w+)(<=|>=|!=|=|<|>)(.+)$")
-_COMPARE: dict[str, Callable[[Any, Any], bool]] = {
-    "=": lambda a, b: a == b,
-    "!=": lambda a, b: a != b,
-    "<": lambda a, b: a < b,
-    ">": lambda a, b: a > b,
-    "<=": lambda a, b: a <= b,
-    ">=": lambda a, b: a >= b,
-}
+_COMPARE = {"=": eq, "!=": ne, "<": lt, ">": gt, "<=": le, ">=": ge}
 
 
 class Session:
