@@ -16,11 +16,11 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, hash_code, load_planner, read_action_settings
+from rlftsim.envs.planners.registry import Planner, guard_planner, hash_code, load_planner, read_action_settings
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
-from rlftsim.errors import ConfigError, DataError, whole_number
+from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
     ScenarioValues,
@@ -134,16 +134,10 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
         DataError: the planner calls exit(). Any other error of the planner passes unchanged.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    try:
+    with guard_planner(planner, scenario.scenario_id):
         planner.reset(info)
         while not env.state.ended[0]:
             observation, *_ = env.step(planner.act(observation))
-    except SystemExit as stop:
-        # It would end the command, with exit() even as if all were done.
-        raise DataError(
-            f"planner {type(planner).__name__} calls exit({stop.code!r}) in scenario {scenario.scenario_id}: let it "
-            "raise an error, or choose other scenarios."
-        ) from stop
     return env.result()
 
 

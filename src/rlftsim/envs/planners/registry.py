@@ -8,12 +8,13 @@ import importlib
 import inspect
 import secrets
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Protocol, get_args, runtime_checkable
 
 from rlftsim.envs.actions import MIN_HORIZON, ActionType
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.shards import hash_file
 
@@ -103,15 +104,52 @@ def load_planner(name: str) -> Planner:
             f"planner {name!r} calls exit({stop.code!r}) when it is made: let it raise an error."
         ) from stop
     if not isinstance(planner, Planner):
-        if not callable(planner):
-            class_name = type(planner).__name__
-            raise ConfigError(f"planner {name!r} is of type {class_name}: give it reset(info) and act(observation).")
-        _check_argument(f"planner {name!r}", planner, "observation")
-        planner = CallablePlanner(planner)
+        if callable(planner):
+            _check_argument(f"planner {name!r}", planner, "observation")
+        planner = to_planner(planner, f"planner {name!r}")
     _check_argument(f"reset of planner {name!r}", planner.reset, "info")
     _check_argument(f"act of planner {name!r}", planner.act, "observation")
     read_action_settings(planner)  # an unknown action ends here, not in the first episode
     return planner
+
+
+def to_planner(planner: Any, name: str = "planner") -> Planner:
+    """A planner, of a name, a function from observation to action, or itself.
+
+    Args:
+        planner: Name that `load_planner` takes, function, or object with `reset` and `act`.
+        name: Name of the planner at the beginning of the message.
+
+    Raises:
+        ConfigError: None of these.
+    """
+    if isinstance(planner, str):
+        return load_planner(planner)
+    if isinstance(planner, Planner) and not isinstance(planner, type):
+        return planner
+    if not callable(planner) or isinstance(planner, type):
+        raise ConfigError(f"{name} is of type {type(planner).__name__}: give it reset(info) and act(observation).")
+    return CallablePlanner(planner)
+
+
+@contextmanager
+def guard_planner(planner: Planner, scenario_id: str) -> Iterator[None]:
+    """Turn a planner's exit(), which would end the command as if all were done, into an error.
+
+    Args:
+        planner: Planner that is called within.
+        scenario_id: Scenario for the message.
+
+    Raises:
+        DataError: in place of a SystemExit. Any other error of the planner passes unchanged.
+    """
+    try:
+        yield
+    except SystemExit as stop:
+        raise DataError(
+            f"planner {type(planner).__name__} calls exit({stop.code!r}) in scenario {scenario_id}: let it "
+            "raise an error, or choose other scenarios."
+        ) from stop
 
 
 def _check_argument(name: str, function: Callable[..., Any], argument: str) -> None:
