@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,6 @@ class FailureChain:
         self.num_blocks = source.config.max_steps // self.block_steps
         self.num_steps_run = 0
         """Steps of all episodes so far, the shared ones that branches run again included."""
-        self._episodes: dict[int, Episode] = {}
 
     def start(self, numbers: Int64[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
         """Undisturbed episodes, see `Chain`."""
@@ -290,10 +289,13 @@ class FailureChain:
         return tuple(Dice(self.seed, int(number)) for number in numbers)
 
     def _episode(self, size: int) -> Episode:
-        """Scenes of the scenario side by side, made once for each size."""
-        if size not in self._episodes:
-            self._episodes[size] = self.source.episode([self.source.scenario(self.scenario_id)] * size)
-        return self._episodes[size]
+        return _build_episode(self.source, self.scenario_id, size)
+
+
+@lru_cache(maxsize=6)
+def _build_episode(source: Source, scenario_id: str, size: int) -> Episode:
+    """Scenes of a scenario side by side."""
+    return source.episode([source.scenario(scenario_id)] * size)
 
 
 def copy_planner(planner: Planner) -> Planner:
