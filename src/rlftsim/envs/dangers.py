@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 
 from rlftsim.envs.actions import ACCELERATION_MPS2, signed_speed
-from rlftsim.envs.contact import Collision
+from rlftsim.envs.contact import STOPPED_MPS, Collision
 from rlftsim.envs.episode import Episode, EpisodeState, off_road_m
 from rlftsim.envs.planner_scores import find_signals
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M
@@ -133,22 +133,26 @@ class Contact:
         now, before = track[-1][scene], track[-1 - TURN_STEPS][scene]
         turn_rate = wrapped(now[:, 2] - before[:, 2]) / (TURN_STEPS * STEP_S)
         turn_rate = np.where(np.hypot(now[:, 3], now[:, 4]) < STANDING_MPS, 0.0, turn_rate)
-        other, size = now[rows], world_size[rows]
-        speed = np.maximum(signed_speed(now[agent]), STANDING_MPS)
-        stopping_s = np.minimum(AHEAD_S, speed / ACCELERATION_MPS2)
-        driven = np.stack([speed * AHEAD_S, speed * stopping_s - ACCELERATION_MPS2 / 2 * stopping_s**2])  # [2, t]
-        ego = _arc(now[agent], driven, turn_rate[agent] / speed * driven)  # [2, t, 3]
-        path = _arc(other, np.hypot(other[:, 3], other[:, 4]) * AHEAD_S[:, None], turn_rate[rows] * AHEAD_S[:, None])
-        is_standing = np.hypot(other[:, 3], other[:, 4]) < STANDING_MPS
+        other, size, time = now[rows], world_size[rows], AHEAD_S[:, None]
+        # 1. poses of the planner that goes on and of one that brakes, and of the others
+        speed = max(float(signed_speed(now[agent])), 0.0)
+        driving_s = np.stack([AHEAD_S, np.minimum(AHEAD_S, speed / ACCELERATION_MPS2)])  # [2, t]
+        driven = np.stack([speed * AHEAD_S, speed * driving_s[1] - ACCELERATION_MPS2 / 2 * driving_s[1] ** 2])
+        ego = _arc(now[agent], driven, turn_rate[agent] / max(speed, STANDING_MPS) * driven)  # [2, t, 3]
+        other_speed = np.hypot(other[:, 3], other[:, 4])
+        path = _arc(other, other_speed * time, turn_rate[rows] * time)  # [t, K, 3]
+        # 2. standard deviations ahead of the others, behind them, and to their sides; who brakes does not back up
+        is_standing = other_speed < STANDING_MPS
         acceleration, drift, position = np.where(is_standing[:, None], STANDING, MOVING).T
-        time = AHEAD_S[:, None]
-        sigma = np.stack([position + acceleration * time**2 / 2, position + drift * time], -1)  # [t, K, 2]
-        # the planner is to blame for what its front meets, and for standing ones that it touches anywhere
-        points = _OUTLINE * view.ego_size
-        distance = _distances(ego, points, path, size, sigma)  # [2, t, K, p]
-        front = distance[..., : len(_FRONT)].min(-1)
-        nearest = np.where(is_standing | (not self.at_fault), distance.min(-1), front)
-        return (nearest + SIGMA_PER_S * time).min(1)
+        ahead = acceleration * time**2 / 2
+        sigma = position + np.stack([ahead, np.minimum(ahead, other_speed * time), drift * time])  # [3, t, K]
+        distance = _distances(ego, _OUTLINE * view.ego_size, path, size, sigma)  # [2, t, K, p]
+        if not self.at_fault:
+            return (distance.min(-1) + SIGMA_PER_S * time).min(1)
+        # 3. the planner is to blame while it moves: for what its front meets, and for standing ones anywhere
+        nearest = np.where(is_standing, distance.min(-1), distance[..., : len(_FRONT)].min(-1))
+        is_moving = (speed > STOPPED_MPS) & (driving_s >= AHEAD_S)
+        return np.where(is_moving[..., None], nearest + SIGMA_PER_S * time, np.inf).min(1)
 
 
 def _arc(
@@ -166,7 +170,7 @@ def _distances(
     points: Float[np.ndarray, "p 2"],
     other: Float[np.ndarray, "t K 3"],
     size: Float[np.ndarray, "K 2"],
-    sigma: Float[np.ndarray, "t K 2"],
+    sigma: Float[np.ndarray, "3 t K"],
 ) -> Float[np.ndarray, "2 t K p"]:
     """Distances of points of the planner's box to other boxes, in standard deviations along and across the others."""
     cos, sin = np.cos(ego[..., 2, None]), np.sin(ego[..., 2, None])
@@ -174,9 +178,12 @@ def _distances(
     y = ego[..., 1, None] + sin * points[:, 0] + cos * points[:, 1]
     dx, dy = x[:, :, None] - other[..., :1], y[:, :, None] - other[..., 1:2]  # [2, t, K, p]
     cos, sin = np.cos(other[..., 2:]), np.sin(other[..., 2:])
-    along = np.maximum(np.abs(cos * dx + sin * dy) - size[:, :1] / 2, 0.0) / sigma[..., :1]
-    across = np.maximum(np.abs(cos * dy - sin * dx) - size[:, 1:] / 2, 0.0) / sigma[..., 1:]
-    return np.hypot(along, across)
+    along, across = cos * dx + sin * dy, cos * dy - sin * dx
+    off_x = np.maximum(np.abs(along) - size[:, :1] / 2, 0.0) / np.where(
+        along > 0, sigma[0, ..., None], sigma[1, ..., None]
+    )
+    off_y = np.maximum(np.abs(across) - size[:, 1:] / 2, 0.0) / sigma[2, ..., None]
+    return np.hypot(off_x, off_y)
 
 
 @dataclass(frozen=True)

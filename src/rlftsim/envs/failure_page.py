@@ -1,4 +1,4 @@
-"""Page of failures: films of the most probable ones, what would have avoided them, and whether the traffic was usual."""
+"""Page of failures: films of the most probable, what would have avoided them, and whether the traffic was usual."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,8 +30,8 @@ BEFORE_STEPS, AFTER_STEPS = 30, 5
 """Steps of a film before and after the event."""
 _CSS = """
 .failure { margin: 2rem 0; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .5rem 1.5rem; margin: .5rem 0; }
-.facts dt { color: var(--ink-muted, inherit); font-size: .85rem; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .5rem 1.5rem; }
+.facts dt { color: var(--muted); font-size: .85rem; }
 .facts dd { margin: 0; }
 .table-scroll { overflow-x: auto; }
 .failures-table td, .failures-table th { padding: .2rem .8rem .2rem 0; text-align: left; white-space: nowrap; }
@@ -50,6 +50,21 @@ class Exhibit:
     """Planners, and full braking, with which the event does not happen among the same dice."""
     rank: float
     """Fraction of undisturbed episodes whose traffic is less probable, up to the event; NaN without a traffic model."""
+
+    def facts(self) -> dict[str, str]:
+        """What is known about the failure, in words."""
+        failure = self.failure
+        contact = f"{failure.contact.replace('_', ' ')}, {'planner' if failure.at_fault else 'other'} at fault"
+        return {
+            "scenario": failure.scenario_id,
+            "probability": f"{failure.probability:.2g} in its scenario",
+            "at": f"{failure.step * STEP_S:.1f} s",
+            "contact": f"{contact}, closing at {failure.closing_mps:.1f} m/s" if failure.contact else "none",
+            "avoided by": ", ".join(self.avoided_by) or "none that was tried",
+            "ordinary traffic?": "no traffic model" if np.isnan(self.rank)
+            else f"more probable than {self.rank:.0%} of undisturbed episodes",
+            "again": f"rlftsim failures show FOLDER {self.number}",
+        }  # fmt: skip
 
 
 def build_exhibit(config: StudyConfig, number: int, failure: Failure) -> Exhibit:
@@ -79,11 +94,11 @@ def build_exhibit(config: StudyConfig, number: int, failure: Failure) -> Exhibit
 
 
 class TrafficLog:
-    """Log-probability of the decisions of all agents that follow the traffic model, as an episode goes on."""
+    """Log-probability of the decisions of all agents that follow the traffic model, as episodes side by side go on."""
 
     def __init__(self) -> None:
         self.steps: list[int] = []
-        self.log_prob: list[Float[np.ndarray, "B"]] = []
+        self.log_prob: list[np.ndarray] = []
 
     def observe(self, episode: Episode, state: EpisodeState) -> None:
         """Add the decision of the running block, once."""
@@ -192,9 +207,7 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
         build_exhibit(study.config, failures.index(failure), failure) for failure in choose_failures(failures, limit)
     ]
     cells = "".join(f"<th>{escape(heading)}</th>" for heading in HEADINGS)
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in study_rows(study)
-    )
+    rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in study_rows(study))
     title = f"Failures of {study.config.planner}"
     intro = (
         f"{study.describe_total()}. Traffic: {study.config.traffic}, {study.config.model}. Every film is a sample of "
@@ -206,19 +219,10 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
 
 
 def _exhibit_html(exhibit: Exhibit) -> str:
-    failure, probability = exhibit.failure, exhibit.failure.probability
-    contact = f"{failure.contact.replace('_', ' ')}, {'planner' if failure.at_fault else 'other'} at fault"
-    facts = {
-        "probability": f"{probability:.2g} in its scenario",
-        "at": f"{failure.step * STEP_S:.1f} s",
-        "contact": f"{contact}, closing at {failure.closing_mps:.1f} m/s" if failure.contact else "none",
-        "avoided by": ", ".join(exhibit.avoided_by) or "none that was tried",
-        "ordinary traffic?": "no model" if np.isnan(exhibit.rank)
-        else f"more probable than {exhibit.rank:.0%} of undisturbed episodes",
-        "again": f"rlftsim failures show FOLDER {exhibit.number}",
-    }  # fmt: skip
-    animation = build_animation({"planner": exhibit.record.first(min(failure.step + AFTER_STEPS, exhibit.record.steps))})
-    first_step = CURRENT_STEP + max(failure.step - BEFORE_STEPS, 0)
-    terms = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in facts.items())
-    figure = animation_html(replace(animation, title=f"scenario {failure.scenario_id}", first_step=first_step))
+    step, record = exhibit.failure.step, exhibit.record
+    animation = build_animation({"planner": record.first(min(step + AFTER_STEPS, record.steps))})
+    first_step = CURRENT_STEP + max(step - BEFORE_STEPS, 0)
+    facts = exhibit.facts().items()
+    terms = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in facts)
+    figure = animation_html(replace(animation, first_step=first_step))
     return f'<section class="failure"><dl class="facts">{terms}</dl>{figure}</section>'
