@@ -81,6 +81,9 @@ def test_without_an_event_the_bound_is_that_of_undisturbed_paths():
     low, high = estimate_interval(np.zeros(10), 640)
     assert low == 0.0
     assert (1 - high) ** 640 == pytest.approx(0.05)
+    low, high = estimate_interval(np.ones(10), 640)
+    assert low**640 == pytest.approx(0.05)
+    assert high == 1.0
 
 
 def test_one_repeat_has_no_interval():

@@ -4,9 +4,10 @@ An event of your own is an object with `danger(view) -> float`. Splitting (`envs
 and cheap for a good one: of two moments the one with the greater danger should be likelier to end in the event.
 
 The danger of a contact is minus the number of standard deviations by which another agent has to depart from its speed
-and turn rate so that both meet within 3 s: half of that if the planner goes on as now, and half of that if it brakes.
-The first half sees conflicts early, the second one ranks those that a planner answers by braking anyway, such as a
-queue ahead. Frame: map, meters, seconds; K other agents.
+and turn rate so that both meet within 3 s. It is counted twice: if the planner goes on as now, which sees conflicts
+early, and if it brakes, which ranks those that a planner answers by braking anyway. The geometric mean of both, with
+weights 3 to 1, told failing episodes from others best, 1 and 2 s before the contact. Frame: map, meters, seconds; K
+other agents.
 """
 
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ STANDING = (0.3, 0.0, 0.1)
 STANDING_MPS = 0.5
 SIGMA_PER_S = 0.5
 """What a second until the contact counts, in standard deviations."""
+GOES_ON = 0.75
+"""Weight of a planner that goes on, against one that brakes."""
 REACH_M = 60.0
 TURN_STEPS = 3
 """Steps that turn rates are measured over."""
@@ -120,11 +123,11 @@ class Contact:
     """True = only contacts that are its fault count, see `contact.classify_collision`."""
 
     def danger(self, view: StepView) -> float:
-        """0 from the contact on; before, minus half the sum of standard deviations, see the module."""
+        """0 from the contact on; before, minus the mean number of standard deviations, see the module."""
         if any(collision.at_fault or not self.at_fault for collision in view.collisions):
             return 0.0
         costs = self.costs(view)
-        return min(-float(costs.mean(0).min()), NEARLY) if costs.size else NEVER
+        return min(-float((costs[0] ** GOES_ON * costs[1] ** (1 - GOES_ON)).min()), NEARLY) if costs.size else NEVER
 
     def costs(self, view: StepView) -> Float[np.ndarray, "2 K"]:
         """Standard deviations to a contact with each agent near, if the planner goes on as now, and if it brakes."""

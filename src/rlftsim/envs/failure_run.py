@@ -4,10 +4,10 @@ An interrupted study goes on where it was, and a larger budget adds to a smaller
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from rlftsim.jobs.runner import Joining, Runner, Share
 
 ABOUT = "failures.json"
 """Settings of the study in a folder."""
+Value = TypeVar("Value")
 
 
 def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int], Runner]) -> Study:
@@ -108,10 +109,10 @@ def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict
 
 
 def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
-    pilot = Pilot(*(values[field] for field in ("scenario_id", "danger", "driven_m", "num_steps", "problem")))
+    pilot = _build(Pilot, values)
     if pilot.scenario_id != name:
         raise ValueError("of another scenario")
-    return replace(pilot, danger=tuple(map(float, pilot.danger)))
+    return pilot
 
 
 def _drive_repeat(config: StudyConfig, items: Sequence[tuple[str, int]], position: int) -> dict[str, object]:
@@ -119,8 +120,20 @@ def _drive_repeat(config: StudyConfig, items: Sequence[tuple[str, int]], positio
 
 
 def _read_repeat(name: str, values: Mapping[str, Any]) -> Repeat:
-    failures = tuple(Failure(**{**failure, "dice": tuple(failure["dice"])}) for failure in values["failures"])
-    return Repeat(float(values["probability"]), int(values["num_levels"]), int(values["num_steps"]), failures)
+    failures = tuple(_build(Failure, failure) for failure in values["failures"])
+    return _build(Repeat, {**values, "failures": failures})
+
+
+def _build(cls: type[Value], values: Mapping[str, Any]) -> Value:
+    """Dataclass of values of a file, of which others are left out.
+
+    Raises:
+        KeyError, TypeError, ValueError: The file was cut or edited.
+    """
+    try:
+        return cls(**{field.name: values[field.name] for field in fields(cls)})  # type: ignore[arg-type]
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
 
 
 def _show_estimate(runner: Runner, folder: Path) -> Runner:

@@ -29,11 +29,11 @@ from rlftsim.envs.failures import Failure, FailureChain, Repeat, make_source
 from rlftsim.envs.planners.registry import Planner, hash_code, load_planner
 from rlftsim.envs.source import Source
 from rlftsim.envs.splitting import KILLED, estimate_interval
-from rlftsim.errors import ConfigError, DataError, in_short, whole_number
+from rlftsim.errors import ConfigError, DataError, check_types, in_short, whole_number
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.documents import parse_json
+from rlftsim.jobs.documents import first_line, parse_json
 from rlftsim.jobs.files import write_atomically
-from rlftsim.jobs.tables import read_parquet, read_parquet_metadata
+from rlftsim.jobs.tables import check_columns, read_parquet, read_parquet_metadata
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.types import STEP_S
 
@@ -64,6 +64,7 @@ class StudyConfig:
     limit: int | None = None
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name, least in (("particles", 2), ("pilot", 2), ("seed", 0)):
             whole_number(name, getattr(self, name), least)
         if self.event not in EVENTS:
@@ -134,6 +135,13 @@ class Pilot:
     """Steps of all of them."""
     problem: str = ""
     """Reason for leaving the scenario out."""
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        object.__setattr__(self, "danger", tuple(map(float, self.danger)))
+        is_whole = self.num_steps > 0 and len(self.danger) > 1 and 0 <= self.driven_m < math.inf
+        if not (self.problem or is_whole):
+            raise ConfigError(f"a pilot of {self.num_steps} steps, {len(self.danger)} episodes, {self.driven_m} m.")
 
     def guess(self) -> float:
         """Probability of the event, roughly: the rate, or beyond all episodes the tail of the upper half."""
@@ -227,7 +235,7 @@ class Study:
                 f"fewer than {high:.3g} per {unit}" if rate == 0
                 else f"{rate:.3g} per {unit}" + (f" [{low:.3g}, {high:.3g}]" if math.isfinite(low) else "")
             )  # fmt: skip
-        note = "" if math.isfinite(values[1]) else "; without an interval: some scenarios have one repeat alone"
+        note = "" if math.isfinite(values[1]) else "; without an interval: too few repeats"
         return f"{self.config.event} of {self.config.planner}: {', '.join(texts)}{note}"
 
     def write(self, path: Path) -> None:
@@ -265,10 +273,10 @@ def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
     try:
         about = parse_json(read_parquet_metadata(path)[b"rlftsim"], way_out, source=str(path))
         about["scenarios"] = about["scenarios"] and tuple(about["scenarios"])
-        row = table.slice(number, 1).to_pylist()[0]
-        return StudyConfig(**about), Failure(**{**row, "dice": tuple(row["dice"])})
-    except (KeyError, TypeError) as error:
-        raise DataError(f"{path} is no table of failures ({error}): {way_out}.") from None
+        check_columns(table, SCHEMA)
+        return StudyConfig(**about), Failure(**table.slice(number, 1).to_pylist()[0])
+    except (ConfigError, DataError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} is no table of failures ({first_line(error)}): {way_out}.") from None
 
 
 def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[int]:

@@ -30,7 +30,7 @@ from rlftsim.envs.result import Result
 from rlftsim.envs.source import Source
 from rlftsim.envs.splitting import estimate_interval, split
 from rlftsim.envs.world import Dice, with_dice
-from rlftsim.errors import ConfigError, DataError, in_short, whole_number
+from rlftsim.errors import ConfigError, DataError, check_types, in_short, whole_number
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 
@@ -63,6 +63,12 @@ class Failure:
     agent: int = -1
     """Object id of the agent that is touched."""
 
+    def __post_init__(self) -> None:
+        check_types(self)
+        object.__setattr__(self, "dice", tuple(self.dice))
+        if self.step < 0 or not all(isinstance(number, int) and number >= 0 for number in self.dice):
+            raise ConfigError(f"a failure has whole numbers of step and dice, got {in_short([self.step, self.dice])}.")
+
 
 @dataclass(frozen=True)
 class Repeat:
@@ -73,6 +79,11 @@ class Repeat:
     num_steps: int
     """Steps of the world, those included that branches share with their parents."""
     failures: tuple[Failure, ...]
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        if not (0 <= self.probability <= 1 and self.num_steps > 0):
+            raise ConfigError(f"no estimate has probability {self.probability} after {self.num_steps} steps.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,8 +272,12 @@ class FailureChain:
             observe: Function that is called after each action.
 
         Raises:
-            DataError: The planner drives otherwise than before.
+            DataError: The planner drives otherwise than before, or the dice are of other blocks.
         """
+        if len(failure.dice) != self.num_blocks:
+            raise DataError(
+                f"a failure with dice of {len(failure.dice)} blocks, not {self.num_blocks}: estimate again."
+            )
         [path], episode, state = self.run(np.array([failure.dice]), observe=observe)
         if path.digest != failure.digest:
             raise DataError(

@@ -126,7 +126,8 @@ def estimate_interval(estimates: Float[np.ndarray, "R"], num_undisturbed: int) -
     """95 % interval of a probability by independent unbiased estimates.
 
     Student's interval of the mean, on the log scale where all estimates are positive. Without any event the upper end
-    is the exact one-sided bound of undisturbed paths; a single estimate with an event has no interval (NaN).
+    is the exact one-sided bound of undisturbed paths, and likewise the lower end where all of them meet the event. A
+    single estimate between has no interval (NaN).
 
     Args:
         estimates: Unbiased estimates, a number per repeat.
@@ -134,6 +135,8 @@ def estimate_interval(estimates: Float[np.ndarray, "R"], num_undisturbed: int) -
     """
     if not estimates.any():
         return 0.0, 1 - 0.05 ** (1 / num_undisturbed)
+    if (estimates == 1).all():
+        return 0.05 ** (1 / num_undisturbed), 1.0
     if len(estimates) < 2 or not estimates.all():
         low, high = mean_interval(estimates).interval
         return max(low, 0.0) if math.isfinite(low) else low, min(high, 1.0) if math.isfinite(high) else high
