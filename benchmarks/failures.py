@@ -43,7 +43,8 @@ def count_events(config: StudyConfig, scenario_id: str, episodes: int, out: Path
         def drive(first: int = first) -> dict:
             chain = config.chain(scenario_id)
             paths, _ = chain.start(np.arange(first, first + CHUNK))
-            return {"events": sum(bool((p.danger >= 0).any()) for p in paths), "steps": chain.num_steps_run}
+            steps = sum(len(path.motion) for path in paths)
+            return {"events": sum(bool((path.danger >= 0).any()) for path in paths), "steps": steps}
 
         values = kept(out / f"{config.planner}-{scenario_id}-{first:05d}.json", drive)
         total, steps = total + values["events"], steps + values["steps"]
@@ -52,7 +53,7 @@ def count_events(config: StudyConfig, scenario_id: str, episodes: int, out: Path
 
 def split(config: StudyConfig, scenario_id: str, repeat: int) -> dict:
     """An estimate by splitting."""
-    return asdict(config.chain(scenario_id, repeat).estimate(config.particles))
+    return asdict(config.chain(scenario_id, repeat).estimate(config.particles, 1)[0])
 
 
 def compare_with_brute_force(out: Path, quick: bool) -> None:

@@ -20,7 +20,7 @@ from rlftsim.envs.failures import Repeat
 from rlftsim.errors import ConfigError, DataError
 
 # a planner that does not look, in traffic that stops: it fails soon, and often
-LINE = ["failures", "constant_velocity", "--data", "synthetic", "--limit", "2", "--particles", "2", "--budget", "4000"]
+LINE = ["failures", "constant_velocity", "--data", "synthetic", "--limit", "2", "--particles", "2", "--budget", "8000"]
 
 
 def pilot(danger, name="a"):
@@ -39,14 +39,12 @@ def test_a_budget_is_a_duration_of_a_core_or_a_number_of_steps():
             parse_budget(text)
 
 
-def test_the_budget_goes_where_failures_are_likely_and_every_scenario_has_two_repeats():
+def test_the_budget_goes_where_failures_are_likely_and_every_scenario_has_a_round():
     pilots = [pilot([-9.0, -8.5, -8.2, -8.0]), pilot([-3.0, -1.0, -0.5, 0.0]), pilot([-np.inf] * 4)]
     repeats = share_budget(pilots, 16, 200_000)
-    assert min(repeats) >= 2
-    assert repeats[1] == max(repeats) > 10 * repeats[0]
-    with pytest.raises(
-        ConfigError, match=r"too small for one repeat of each of 3 scenarios: give --budget .*m or more"
-    ):
+    assert min(repeats) >= 1
+    assert repeats[1] == max(repeats) > 5 * repeats[0]
+    with pytest.raises(ConfigError, match=r"too small for 4 repeats in each of 3 scenarios: give --budget .*m or more"):
         share_budget(pilots, 16, 5000)
 
 

@@ -75,12 +75,12 @@ def build_exhibit(config: StudyConfig, number: int, failure: Failure) -> Exhibit
         number: Row of failures.parquet.
         failure: Failure of that row.
     """
-    chain, log = config.chain(failure.scenario_id, failure.repeat), TrafficLog()
+    chain, log = config.chain(failure.scenario_id), TrafficLog()
     record = chain.run_again(failure, log.observe).record
     others = [name for name in OTHER_PLANNERS if name != config.planner]
     avoided_by = [
         name for name in others
-        if not _happens(config.chain(failure.scenario_id, failure.repeat, name), failure.dice)
+        if not _happens(config.chain(failure.scenario_id, planner=name), failure.dice)
     ]  # fmt: skip
     if not _happens(chain, failure.dice, brake(record, failure.step)):
         avoided_by.append(f"full braking {EARLIER_STEPS * STEP_S:g} s earlier")
@@ -202,7 +202,7 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
         path: File to write.
         limit: Largest number of failures with a film.
     """
-    failures = [failure for failure, _ in study.failures]
+    failures = study.failures
     exhibits = [
         build_exhibit(study.config, failures.index(failure), failure) for failure in choose_failures(failures, limit)
     ]

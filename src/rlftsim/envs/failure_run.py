@@ -6,12 +6,13 @@ An interrupted study goes on where it was, and a larger budget adds to a smaller
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from rlftsim.envs.failure_study import FAILURES, Pilot, ScenarioEstimate, Study, StudyConfig, share_budget
+from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimate, Study, StudyConfig, share_budget
 from rlftsim.envs.failures import Failure, Repeat
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.resumable import ScenarioValues
@@ -61,17 +62,17 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         raise DataError(all_pilots[0].problem)
     # 2. the repeats
     counts = share_budget(pilots, config.particles, budget)
-    items = [(pilot.scenario_id, repeat) for pilot, count in zip(pilots, counts) for repeat in range(1, count + 1)]
-    names = [f"{scenario_id}-{repeat}" for scenario_id, repeat in items]
-    repeats: list[Repeat] = _measure(
+    items = [(pilot.scenario_id, number) for pilot, count in zip(pilots, counts) for number in range(1, count + 1)]
+    names = [f"{scenario_id}-{number}" for scenario_id, number in items]
+    rounds: list[tuple[Repeat, ...]] = _measure(
         f"failures of {config.planner}",
-        ScenarioValues(out / "repeats", names, _agree(names, identity), _read_repeat),
-        partial(_drive_repeat, config, items),
+        ScenarioValues(out / "repeats", names, _agree(names, identity), _read_round),
+        partial(_drive_round, config, items),
         _show_estimate(runner(len(items)), out / "repeats"),
     )
     ends = np.cumsum(counts)
     estimates = [
-        ScenarioEstimate(pilot, config.particles, tuple(repeats[end - count : end]))
+        ScenarioEstimate(pilot, config.particles, tuple(chain.from_iterable(rounds[end - count : end])))
         for pilot, count, end in zip(pilots, counts, ends)
     ]
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
@@ -98,14 +99,16 @@ def _measure(
 
 
 def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict[str, object]:
-    chain = config.chain(ids[position])
+    episodes = config.chain(ids[position])
     try:
-        chain.check_start()
+        episodes.check_start()
     except DataError as error:
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
-    paths, danger = chain.start(np.arange(config.pilot))
+    paths, danger = episodes.start(np.arange(config.pilot))
     driven_m = float(np.mean([path.driven_m for path in paths]))
-    return asdict(Pilot(ids[position], tuple(danger.max(1).tolist()), driven_m, chain.num_steps_run))
+    return asdict(
+        Pilot(ids[position], tuple(danger.max(1).tolist()), driven_m, sum(len(path.motion) for path in paths))
+    )
 
 
 def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
@@ -115,13 +118,19 @@ def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
     return pilot
 
 
-def _drive_repeat(config: StudyConfig, items: Sequence[tuple[str, int]], position: int) -> dict[str, object]:
-    return asdict(config.chain(*items[position]).estimate(config.particles))
+def _drive_round(config: StudyConfig, items: Sequence[tuple[str, int]], position: int) -> dict[str, object]:
+    repeats = config.chain(*items[position]).estimate(config.particles, REPEATS)
+    return {"probability": float(np.mean([r.probability for r in repeats])), "repeats": [asdict(r) for r in repeats]}
 
 
-def _read_repeat(name: str, values: Mapping[str, Any]) -> Repeat:
-    failures = tuple(_build(Failure, failure) for failure in values["failures"])
-    return _build(Repeat, {**values, "failures": failures})
+def _read_round(name: str, values: Mapping[str, Any]) -> tuple[Repeat, ...]:
+    repeats = tuple(
+        _build(Repeat, {**repeat, "failures": tuple(_build(Failure, failure) for failure in repeat["failures"])})
+        for repeat in values["repeats"]
+    )
+    if len(repeats) != REPEATS:
+        raise ValueError("some repeats are missing")
+    return repeats
 
 
 def _build(cls: type[Value], values: Mapping[str, Any]) -> Value:

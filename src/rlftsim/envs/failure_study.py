@@ -40,6 +40,10 @@ from rlftsim.scenario.types import STEP_S
 STEPS_PER_S = 600
 """Steps that a second of a budget stands for: about what a core does."""
 FAILURES = "failures.parquet"
+REPEATS = 4
+"""Estimates of a round, which run side by side."""
+NUMBERS_PER_ROUND = 1 << 24
+"""Dice of a round; those of the next round follow."""
 LEAST_PROBABILITY = 1e-9
 _BUDGET = re.compile(r"(\d+(?:\.\d+)?)([smh]?)")
 _SECONDS = {"s": 1, "m": 60, "h": 3600}
@@ -55,7 +59,7 @@ class StudyConfig:
     model: str = "demo-base"
     traffic: str = "policy"
     event: str = "at_fault_collision"
-    particles: int = 16
+    particles: int = 8
     """Undisturbed episodes that a repeat begins with."""
     pilot: int = 16
     """Undisturbed episodes of each scenario that share out the budget."""
@@ -90,16 +94,19 @@ class StudyConfig:
             source.scenario(scenario_id)
         return list(self.scenarios or source.scenario_ids)[: self.limit]
 
-    def chain(self, scenario_id: str, repeat: int = 0, planner: str | None = None) -> FailureChain:
-        """Episodes of a scenario; repeat 0 is the pilot.
+    def chain(self, scenario_id: str, number: int = 0, planner: str | None = None) -> FailureChain:
+        """Episodes of a scenario.
 
         Args:
             scenario_id: Scenario of the data.
-            repeat: Number of the repeat, each with dice of its own.
+            number: Number of the round, each with dice of its own; 0 = the pilot.
             planner: Name of another planner among the same traffic.
         """
         driver, source = load_source(replace(self, planner=planner or self.planner))
-        return FailureChain(source, driver, scenario_id, find_event(self.event), seed=self.seed, repeat=repeat)
+        first_number = number * NUMBERS_PER_ROUND
+        return FailureChain(
+            source, driver, scenario_id, find_event(self.event), seed=self.seed, first_number=first_number
+        )
 
 
 @lru_cache(maxsize=8)
@@ -196,10 +203,13 @@ class Study:
     """Scenario id to the reason for leaving it out."""
 
     @property
-    def failures(self) -> list[tuple[Failure, float]]:
-        """Failing episodes and the probability of each in its scenario, the most probable first."""
-        weighted = [(f, f.probability / len(s.repeats)) for s in self.scenarios for r in s.repeats for f in r.failures]
-        return sorted(weighted, key=lambda pair: -pair[1])
+    def failures(self) -> list[Failure]:
+        """Failing episodes with the probability of each in its scenario, the most probable first."""
+        failures = [
+            replace(failure, probability=failure.probability / len(scenario.repeats))
+            for scenario in self.scenarios for repeat in scenario.repeats for failure in repeat.failures
+        ]  # fmt: skip
+        return sorted(failures, key=lambda failure: -failure.probability)
 
     def mean_interval(self) -> tuple[float, float, float]:
         """Probability of the event in an episode of these scenarios, a stratified mean, and its 95 % interval."""
@@ -240,14 +250,14 @@ class Study:
 
     def write(self, path: Path) -> None:
         """Write the failing episodes as Parquet, a row each, with all that is needed to run them again."""
-        rows = [{**asdict(failure), "probability": weight} for failure, weight in self.failures]
+        rows = [asdict(failure) for failure in self.failures]
         about = json.dumps(asdict(self.config))
         table = pa.Table.from_pylist(rows, schema=SCHEMA).replace_schema_metadata({"rlftsim": about})
         write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
 
 SCHEMA = pa.schema({
-    "scenario_id": pa.string(), "repeat": pa.int64(), "probability": pa.float64(), "dice": pa.list_(pa.int64()),
+    "scenario_id": pa.string(), "probability": pa.float64(), "dice": pa.list_(pa.int64()),
     "step": pa.int64(), "digest": pa.string(), "contact": pa.string(), "at_fault": pa.bool_(),
     "closing_mps": pa.float64(), "agent": pa.int64(),
 })  # fmt: skip
@@ -280,7 +290,7 @@ def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
 
 
 def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[int]:
-    """Repeats of each scenario: at least two where the budget allows, the others where they narrow the total most.
+    """Rounds of repeats of each scenario: one for each, the others where they narrow the total most.
 
     Args:
         pilots: Pilot of each scenario.
@@ -288,21 +298,19 @@ def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[i
         budget: Steps for all, those of the pilots included.
 
     Raises:
-        ConfigError: Too few steps for one repeat of each scenario.
+        ConfigError: Too few steps for one round of each scenario.
     """
     guess = np.array([pilot.guess() for pilot in pilots])
     per_episode = np.array([pilot.num_steps / len(pilot.danger) for pilot in pilots])
     num_levels = np.log(guess) / math.log(1 - KILLED)
-    cost = particles * per_episode * (1 + KILLED * num_levels)
-    deviation = guess * np.sqrt((1 - guess - np.log(guess)) / particles)
+    cost = REPEATS * particles * per_episode * (1 + KILLED * num_levels)
+    deviation = guess * np.sqrt((1 - guess - np.log(guess)) / (REPEATS * particles))
     rest = budget - sum(pilot.num_steps for pilot in pilots)
     if rest < cost.sum():
         needed = math.ceil((budget - rest + cost.sum()) / STEPS_PER_S / 6) / 10
         raise ConfigError(
-            f"a budget of {budget} steps is too small for one repeat of each of {len(pilots)} scenarios: give "
+            f"a budget of {budget} steps is too small for {REPEATS} repeats in each of {len(pilots)} scenarios: give "
             f"--budget {needed:g}m or more, or choose fewer with --limit."
         )
-    least = 2 if rest >= 2 * cost.sum() else 1
-    rest -= least * float(cost.sum())
     share = deviation * np.sqrt(cost)
-    return [int(number) for number in least + np.floor(rest * share / share.sum() / cost)]
+    return [int(number) for number in 1 + np.floor((rest - cost.sum()) * share / share.sum() / cost)]

@@ -37,8 +37,6 @@ from rlftsim.scenario.types import CURRENT_STEP, Scenario
 BLOCK_STEPS = 5
 BATCH = 16
 """Episodes that run side by side at most."""
-NUMBERS_PER_REPEAT = 1 << 24
-"""Dice of a repeat; those of the next repeat follow."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,6 @@ class Failure:
     """An episode in which the event happens, and all that is needed to run it again."""
 
     scenario_id: str
-    repeat: int
     probability: float
     """Share of the episode in the estimate of its repeat."""
     dice: tuple[int, ...]
@@ -118,24 +115,24 @@ class FailureChain:
         scenario_id: Scenario of the source.
         event: Event whose danger is measured.
         seed: Seed of the traffic.
-        repeat: Number of the repeat; each has dice of its own.
+        first_number: Number of the first dice; those of other chains of the same seed should be far away.
 
     Raises:
         ConfigError: A planner that cannot be copied.
     """
 
-    def __init__(self, source: Source, planner: Planner, scenario_id: str, event: Event, *, seed: int, repeat: int = 0):
+    def __init__(
+        self, source: Source, planner: Planner, scenario_id: str, event: Event, *, seed: int, first_number: int = 0
+    ):
         self.source, self.scenario_id, self.event = source, scenario_id, event
-        self.seed, self.repeat, self.planner = seed, repeat, copy_planner(planner)
+        self.seed, self.first_number, self.planner = seed, first_number, copy_planner(planner)
         per_decision = source.policy.steps_per_decision if source.policy is not None else 1
         self.block_steps = math.lcm(BLOCK_STEPS, per_decision, source.controls.steps)
         self.num_blocks = source.config.max_steps // self.block_steps
-        self.num_steps_run = 0
-        """Steps of all episodes so far, the shared ones that branches run again included."""
 
     def start(self, numbers: Int64[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
         """Undisturbed episodes, see `Chain`."""
-        dice = np.repeat(numbers[:, None] + self.repeat * NUMBERS_PER_REPEAT, self.num_blocks, 1)
+        dice = np.repeat(numbers[:, None] + self.first_number, self.num_blocks, 1)
         return self._run_all(dice, np.zeros(len(dice), np.int64), np.full(len(dice), None, object))
 
     def branch(
@@ -143,7 +140,7 @@ class FailureChain:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Episodes that leave others at the end of a block, see `Chain`."""
         is_new = np.arange(self.num_blocks) >= blocks[:, None]
-        new_dice = numbers[:, None] + self.repeat * NUMBERS_PER_REPEAT
+        new_dice = numbers[:, None] + self.first_number
         return self._run_all(np.where(is_new, new_dice, [path.dice for path in parents]), blocks, parents)
 
     def _run_all(
@@ -184,7 +181,6 @@ class FailureChain:
         shared = np.zeros(size, np.int64) if blocks is None else blocks[rows]
         given = [None] * size if parents is None else [parents[row] for row in rows]
         episode, dice = self._episode(size), dice[rows]
-        self.num_steps_run += count * self.num_blocks * self.block_steps
         state = start(episode, self._dice(dice[:, 0]))
         danger = np.full((size, 1 + self.num_blocks * self.block_steps), np.nan)
         planners = [self.planner] * size
@@ -235,20 +231,25 @@ class FailureChain:
         ]
         return paths, episode, state
 
-    def estimate(self, particles: int) -> Repeat:
-        """An estimate by splitting, and the episodes in which the event happens.
+    def estimate(self, particles: int, repeats: int) -> tuple[Repeat, ...]:
+        """Independent estimates by splitting, side by side, and the episodes in which the event happens.
 
         Args:
-            particles: Number of undisturbed episodes at the beginning.
+            particles: Number of undisturbed episodes at the beginning of each repeat.
+            repeats: Number of estimates.
         """
-        begun = self.num_steps_run
-        splits = split(self, particles=particles, seed=(self.seed, self.repeat))
-        failing = splits.paths[0][splits.danger[0] >= 0]
-        return Repeat(
-            probability=float(splits.probability[0]),
-            num_levels=int(splits.num_levels[0]),
-            num_steps=self.num_steps_run - begun,
-            failures=tuple(self._describe(path, float(splits.weight[0])) for path in failing),
+        splits = split(self, particles=particles, repeats=repeats, seed=(self.seed, self.first_number))
+        return tuple(
+            Repeat(
+                probability=float(splits.probability[row]),
+                num_levels=int(splits.num_levels[row]),
+                num_steps=int(splits.num_runs[row]) * self.num_blocks * self.block_steps,
+                failures=tuple(
+                    self._describe(path, float(splits.weight[row]))
+                    for path in splits.paths[row][splits.danger[row] >= 0]
+                ),
+            )
+            for row in range(repeats)
         )
 
     def check_start(self) -> None:
@@ -289,7 +290,7 @@ class FailureChain:
     def _describe(self, path: DrivenPath, probability: float) -> Failure:
         """Failure of a path in which the event happens."""
         step = int((path.danger >= 0).argmax())
-        failure = Failure(self.scenario_id, self.repeat, probability, tuple(map(int, path.dice)), step, path.digest)
+        failure = Failure(self.scenario_id, probability, tuple(map(int, path.dice)), step, path.digest)
         last = step + self.source.controls.steps - 1
         contacts = sorted((c for c in path.collisions if step <= c.step <= last), key=lambda c: not c.at_fault)
         if not contacts:
@@ -370,7 +371,7 @@ class FailureEstimate:
         return self.chain.run_again(failure)
 
     def films(self, path: str | PathLike[str], *, limit: int = 1) -> list[Path]:
-        """Write films of failures, the most probable first, of as many repeats as there are; returns their paths.
+        """Write films of failures, the most probable first, that begin differently if there are; returns their paths.
 
         Args:
             path: File of the first film, .mp4 or .webp; "crash.mp4" is followed by "crash-2.mp4".
@@ -413,14 +414,14 @@ def count_monte_carlo(probability: float, estimates: Float[np.ndarray, "R"]) -> 
 
 
 def choose_failures(failures: Sequence[Failure], limit: int) -> list[Failure]:
-    """Failures to show: one of each scenario and repeat first, as the others of a repeat begin alike.
+    """Failures to show: one of each beginning first, as branches of one episode look alike.
 
     Args:
         failures: Failures, those that count most first.
         limit: Largest number of failures.
     """
     seen: dict[tuple[str, int], int] = {}
-    rank = [seen.setdefault((f.scenario_id, f.repeat), len(seen)) for f in failures]
+    rank = [seen.setdefault((f.scenario_id, f.dice[0]), len(seen)) for f in failures]
     turn = [rank[:i].count(rank[i]) for i in range(len(rank))]
     return [failures[i] for i in sorted(range(len(rank)), key=lambda i: turn[i])[:limit]]
 
@@ -473,11 +474,6 @@ def estimate_failures(
     found_event = find_event(event)
     driver = to_planner(planner)
     source = make_source(driver, scenario, policy, **settings)
-    chains = [
-        FailureChain(source, driver, scenario.scenario_id, found_event, seed=seed, repeat=repeat)
-        for repeat in range(1, repeats + 1)
-    ]
-    chains[0].check_start()
-    return FailureEstimate(
-        scenario.scenario_id, tuple(chain.estimate(particles) for chain in chains), particles, chains[0]
-    )
+    chain = FailureChain(source, driver, scenario.scenario_id, found_event, seed=seed)
+    chain.check_start()
+    return FailureEstimate(scenario.scenario_id, chain.estimate(particles, repeats), particles, chain)

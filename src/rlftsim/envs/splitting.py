@@ -56,8 +56,8 @@ class Splits:
     weight: Float[np.ndarray, "R"]
     """Probability that each final path stands for."""
     num_levels: Int64[np.ndarray, "R"]
-    num_blocks: Int64[np.ndarray, "R"]
-    """Blocks that were run with dice of their own, the cost."""
+    num_runs: Int64[np.ndarray, "R"]
+    """Paths that were run, branches included."""
     paths: Shaped[np.ndarray, "R N ..."]
     danger: Float[np.ndarray, "R N"]
     """Largest danger of each final path."""
@@ -76,7 +76,7 @@ def split(chain: Chain, *, particles: int, repeats: int = 1, seed: int | Sequenc
     next_number = repeats * particles
     paths, danger = chain.start(np.arange(next_number))
     running = np.maximum.accumulate(danger, axis=1)  # [R N, T + 1]
-    num_blocks = np.full(repeats, particles * (danger.shape[1] - 1))
+    num_runs = np.full(repeats, particles)
     num_levels, survival, is_active = np.zeros(repeats, np.int64), np.ones(repeats), np.ones(repeats, bool)
     while True:
         # 1. the level of each repeat, and all particles that are not above it
@@ -95,7 +95,7 @@ def split(chain: Chain, *, particles: int, repeats: int = 1, seed: int | Sequenc
                 probability=survival * (top >= 0).mean(1),
                 weight=survival / particles,
                 num_levels=num_levels,
-                num_blocks=num_blocks,
+                num_runs=num_runs,
                 paths=paths.reshape(repeats, particles, *paths.shape[1:]),
                 danger=top,
             )
@@ -109,7 +109,7 @@ def split(chain: Chain, *, particles: int, repeats: int = 1, seed: int | Sequenc
         next_number += len(rows)
         paths[rows], danger = chain.branch(paths[parents], blocks, numbers)
         running[rows] = np.maximum.accumulate(danger, axis=1)
-        np.add.at(num_blocks, repeat, running.shape[1] - 1 - blocks)
+        num_runs += np.bincount(repeat, minlength=repeats)
 
 
 def find_killed(top: Float[np.ndarray, "R N"], level: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R N"]:

@@ -18,7 +18,7 @@ def failures(
     traffic: Literal["policy", "replay", "constant_velocity", "idm"] = "policy",
     event: str = "at_fault_collision",
     budget: str = "10m",
-    particles: int = 16,
+    particles: int = 8,
     split: str = "validation",
     scenario: list[str] | None = None,
     limit: int | None = None,
