@@ -17,10 +17,10 @@ from rlftsim.envs.failures import Failure, Repeat
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.resumable import ScenarioValues
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import group_positions, group_task, run_items
-from rlftsim.jobs.processes import Advance, Task
+from rlftsim.jobs.processes import Task
 from rlftsim.jobs.runner import Joining, Runner, Share
 
 ABOUT = "failures.json"
@@ -78,7 +78,7 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
     study = Study(config, tuple(estimates), problems)
     study.write(out / FAILURES)
-    remove_temporaries_below(out)
+    remove_temporaries([out / FAILURES, out / ABOUT, *out.glob("*/*.json")])  # of processes that were killed
     return study
 
 
@@ -160,9 +160,7 @@ class _Telling:
     folder: Path
     _probability: dict[str, float] = field(default_factory=dict)
 
-    def run(
-        self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
-    ) -> list[Any]:
+    def run(self, task: Task, items: Sequence[Any], *, advance: Any, describe: Callable[[Any], str] = str) -> list[Any]:
         """Results of all items, see `Runner`."""
 
         def tell(count: int = 1, note: str = "") -> None:
