@@ -21,7 +21,6 @@ from pathlib import Path
 import rlftsim
 from rlftsim import errors
 from rlftsim.cli.main import OVERVIEW, VERBS, main
-from rlftsim.cli.mistakes import ACTIONS
 from rlftsim.plugins import is_ours
 from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.recipes.registry import RECIPES
@@ -30,6 +29,7 @@ from rlftsim.training.run_folder import to_plain
 from rlftsim.verbs.plugins import POINTS
 
 ROOT = Path(__file__).resolve().parents[1]
+ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
 REFERENCE = ROOT / "build" / "pages" / "reference"
 PACKAGE = ROOT / "src" / "rlftsim"
 CONFIGS = {

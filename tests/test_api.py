@@ -337,6 +337,33 @@ def test_fine_tuning_equals_the_command_line(base, home):
     assert fingerprint_policy(tuned) == fingerprint_policy(rs.load_policy("runs/by-command"))
 
 
+def test_fine_tuning_by_a_recipe_a_method_and_goals_equals_the_command_line(base, home):
+    flags = "--catk.epochs 0.5 --catk.batch-size 1 --catk.num-candidates 4 --catk.device.accelerator cpu"
+    words = ["finetune", "smart-demo", "--method", "catk", "--goal", "concat", "--model", "runs/base", "--data", SMALL]
+    assert main([*words, *flags.split(), "--out", "runs/by-command"]) == 0
+    recipe = rs.recipe("smart-demo").with_goals()
+    recipe = replace(recipe, catk=replace(recipe.catk, epochs=0.5, batch_size=1, num_candidates=4, device=CPU))
+    start = rs.load_policy("runs/base")
+    rs.finetune(start, SMALL, "runs/by-call", recipe=recipe, method="catk", goal="concat")
+    by_command, by_call = (Path(f"runs/{run}") for run in ("by-command", "by-call"))
+    for file in ("config.json", "model/config.json", "model/model.safetensors"):
+        assert (by_call / file).read_bytes() == (by_command / file).read_bytes()
+    assert "goals by concat" in (by_call / "model" / "README.md").read_text()
+    assert (by_call / "learning_curve.png").exists()
+    assert fingerprint_policy(start) == fingerprint_policy(rs.load_policy("runs/base"))
+
+
+def test_pre_training_further_by_a_recipe_equals_the_command_line(base, home):
+    flags = "--pretrain.epochs 1 --pretrain.batch-size 1 --pretrain.device.accelerator cpu"
+    words = ["pretrain", "smart-demo", "--init-from", "runs/base", "--data", SMALL, "--out", "runs/by-command"]
+    assert main([*words, *flags.split()]) == 0
+    config = replace(rs.recipe("smart-demo").pretrain, epochs=1.0, batch_size=1, device=CPU)
+    further = rs.pretrain("smart-demo", SMALL, "runs/by-call", config, init_from="runs/base")
+    assert fingerprint_policy(further) == fingerprint_policy(rs.load_policy("runs/by-command"))
+    with pytest.raises(ConfigError, match="init_from and vocabulary go with a recipe as the policy"):
+        rs.pretrain("runs/base", SMALL, init_from="runs/base")
+
+
 def test_pre_training_from_a_recipe_makes_a_new_policy_that_is_ready(home):
     training = rs.load_dataset(SMALL, "training")
     model = rs.pretrain(TINY, training, out="runs/pretrained")

@@ -19,9 +19,9 @@ from rlftsim.verbs.check_policy import check_policy as check_policy
 from rlftsim.verbs.compare import compare as compare
 from rlftsim.verbs.evaluate import evaluate as evaluate
 from rlftsim.verbs.finetune import finetune as finetune
-from rlftsim.verbs.finetune import pretrain as pretrain
 from rlftsim.verbs.inputs import load_dataset as load_dataset
 from rlftsim.verbs.inputs import load_policy as load_policy
+from rlftsim.verbs.pretrain import pretrain as pretrain
 from rlftsim.verbs.recipe import recipe as recipe
 from rlftsim.verbs.score import score as score
 from rlftsim.verbs.simulate import simulate as simulate

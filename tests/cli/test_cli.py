@@ -18,9 +18,7 @@ import pytest
 import torch
 
 from rlftsim import __version__
-from rlftsim.cli.main import VERBS, main
-from rlftsim.cli.recipe_verb import with_settings
-from rlftsim.cli.train import Pretrain
+from rlftsim.cli.main import VERBS, main, parse
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -607,9 +605,8 @@ def test_settings_without_effect_are_refused(tmp_path, capsys):
     assert "--model.num-heads cannot be changed with --init-from demo-base, whose weights are made for it" in err
     (tmp_path / "settings.json").write_text(json.dumps({"model": {"max_agent_neighbors": 3}}))
     for start, rest in (("--init_from", []), ("--init-from", ["--config", str(tmp_path / "settings.json")])):
-        verb, flags = with_settings(Pretrain, ["smart-demo", "--data", "synthetic", start, "demo-base", *rest])
-        assert verb.starting_recipe.model.max_agent_neighbors == 24
-        assert "3" not in flags
+        words = ["pretrain", "smart-demo", "--data", "synthetic", "--out", str(tmp_path), start, "demo-base", *rest]
+        assert parse(words).values["policy"].model == load_policy("demo-base").config
 
 
 def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys):

@@ -17,11 +17,18 @@ from rlftsim.recipes.settings import list_sections, recipe_as_json, recipe_as_te
 from rlftsim.scenario.open import open_dataset
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.training.run_folder import flatten, to_plain
+from rlftsim.verbs.commands import COMMANDS
 
 PRETRAIN = ["pretrain", "smart-demo", "--data", "d", "--out", "o", "--vocabulary", "v"]
 FINETUNE = ["finetune", "smart-demo", "--model", "m", "--data", "d", "--out", "o"]
 TOKENS = ["tokens", "--data", "d", "--out", "o"]
 EXPERIMENT = ["experiment", "benchmark"]
+
+
+def settings_of(words):
+    """The recipe with the values of a command line, as the verb gets it."""
+    call = parse(words)
+    return call.values[call.command.recipe]
 
 
 def value_at(settings, name):
@@ -66,13 +73,13 @@ def names_of(config, path=""):
     ],
 )
 def test_a_flag_changes_one_field(words, name, value):
-    found = value_at(parse(words).settings, name)
+    found = value_at(settings_of(words), name)
     assert found == value
     assert type(found) is type(value)
 
 
 def test_flags_leave_everything_else_as_the_recipe_has_it():
-    changed = parse([*FINETUNE, "--finetune.kl.target", "0.02"]).settings
+    changed = settings_of([*FINETUNE, "--finetune.kl.target", "0.02"])
     recipe = recipe_by_name("smart-demo")
     kl = replace(recipe.finetune.kl, target=0.02)
     assert changed == replace(recipe, finetune=replace(recipe.finetune, kl=kl))
@@ -108,11 +115,11 @@ SWITCHES = ["--finetune.kl.no-condition-reference", "--no-goal-logit-bias", "--g
     ids=" ".join,
 )
 def test_a_switch_beside_the_recipe_changes_no_other_setting(words):
-    verb = parse(["finetune", *words])
+    settings = settings_of(["finetune", *words])
     recipe = recipe_by_name("smart-demo").finetune
-    assert verb.recipe == "smart-demo"
-    assert verb.settings.finetune.kl.condition_reference is False
-    assert (verb.settings.finetune.epochs, verb.settings.finetune.num_rollouts) == (recipe.epochs, recipe.num_rollouts)
+    assert settings.model == recipe_by_name("smart-demo").model
+    assert settings.finetune.kl.condition_reference is False
+    assert (settings.finetune.epochs, settings.finetune.num_rollouts) == (recipe.epochs, recipe.num_rollouts)
     assert recipe.num_rollouts != recipe_by_name("smart-tiny").finetune.num_rollouts
 
 
@@ -189,9 +196,9 @@ def test_a_printed_recipe_is_read_back(name, tmp_path, capsys):
     (tmp_path / "mine.json").write_text(capsys.readouterr().out)
     recipe = recipe_by_name(name)
     for words in (PRETRAIN, FINETUNE, TOKENS):
-        verb = parse([*words, "--config", str(tmp_path / "mine.json")])
-        for section in verb.sections:
-            assert getattr(verb.settings, section) == getattr(recipe, section)
+        settings = settings_of([*words, "--config", str(tmp_path / "mine.json")])
+        for section in COMMANDS[words[0]].sections:
+            assert getattr(settings, section) == getattr(recipe, section)
 
 
 def test_the_text_of_a_recipe_has_every_field_and_its_documentation():
@@ -214,7 +221,7 @@ def test_recipes_are_listed_with_a_summary_each(capsys):
 def test_flags_override_a_file_which_overrides_the_recipe(tmp_path):
     path = tmp_path / "some.json"
     path.write_text(json.dumps({"finetune": {"learning_rate": 1e-5, "kl": {"target": 0.5}, "betas": [0.7, 0.8]}}))
-    settings = parse([*FINETUNE, "--finetune.kl.target", "0.02", "--config", str(path)]).settings.finetune
+    settings = settings_of([*FINETUNE, "--finetune.kl.target", "0.02", "--config", str(path)]).finetune
     recipe = recipe_by_name("smart-demo").finetune
     assert (settings.kl.target, settings.learning_rate, settings.betas) == (0.02, 1e-5, (0.7, 0.8))
     assert settings.num_rollouts == recipe.num_rollouts
@@ -225,7 +232,7 @@ def test_a_runs_config_is_read_by_its_method(tmp_path):
     path.write_text(
         json.dumps({"num_candidates": 7, "goal_probability": 0.5, "initial_policy": "ab", "scenarios": "cd"})
     )
-    settings = parse([*FINETUNE, "--method", "catk", "--config", str(path)]).settings
+    settings = settings_of([*FINETUNE, "--method", "catk", "--config", str(path)])
     assert (settings.catk.num_candidates, settings.catk.goal_probability) == (7, 0.5)
     with pytest.raises(
         ConfigError, match=r"config\.json: no setting finetune\.goal_probability: did you mean finetune\."
@@ -294,19 +301,18 @@ def test_a_run_repeated_from_its_own_config_gives_the_same_bits(tmp_path):
     [([], None), (["--goal-logit-bias"], True), (["--no-goal-logit-bias"], False)],
 )
 def test_the_goal_logit_bias_is_on_off_or_left_to_the_model(words, bias):
-    verb = parse([*FINETUNE, "--goal", "concat", *words])
-    assert verb.goal_logit_bias is bias
-    assert "goal" in verb.settings.finetune.reward
-    assert verb.settings.catk.goal_probability == 1
+    values = parse([*FINETUNE, "--goal", "concat", *words]).values
+    assert values["goal_logit_bias"] is bias
+    assert "goal" in values["recipe"].finetune.reward
+    assert values["recipe"].catk.goal_probability == 1
 
 
 def test_a_recipe_without_a_method_has_no_flags_of_it_and_refuses_it(monkeypatch):
     without = replace(recipe_by_name("smart-demo"), catk=None)
     monkeypatch.setitem(RECIPES._registered, "without", lambda: without)
     words = ["without", *FINETUNE[2:]]
-    verb = parse(["finetune", *words])
-    assert verb.settings.catk is None
+    assert settings_of(["finetune", *words]).catk is None
     with pytest.raises(ConfigError, match=r"no flag --catk\.num-candidates"):
         parse(["finetune", *words, "--catk.num-candidates", "4", "--method", "catk"])
     with pytest.raises(ConfigError, match=r"recipe without has no section catk: .* --method rlft"):
-        parse(["finetune", *words, "--method", "catk"]).run()
+        parse(["finetune", *words, "--method", "catk"])

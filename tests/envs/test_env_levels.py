@@ -58,6 +58,18 @@ def test_a_parked_car_under_or_over_the_road_is_not_met(road, up, height_m):
     assert driven("replay", build_scenario("flat", (EGO, BELOW), junction_map())).planner.at_fault_collision_rate == 1.0
 
 
+@pytest.mark.parametrize(("height_m", "meets"), [(1.5, True), (1.65, False), (2.4, False)])
+def test_boxes_meet_where_their_heights_overlap(height_m, meets):  # all boxes are 1.6 m high
+    result = driven("replay", bridge(EGO, BELOW, height_m=height_m))
+    assert (len(result.record.collisions), result.planner.least_ttc_s < 3.0) == (meets, meets)
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+def test_planners_drive_over_a_roof_just_below(name):
+    below = driven(name, bridge(EGO, BELOW, height_m=1.65)).record.agent_motion
+    np.testing.assert_array_equal(below, driven(name, bridge(EGO, height_m=1.65)).record.agent_motion)
+
+
 def test_films_mark_no_overlap_of_cars_above_each_other():
     for scenario, is_marked in (
         (bridge(EGO, BELOW), False),

@@ -1,6 +1,7 @@
 """The loop of a planner and the traffic model: the same dice as `simulate`, forks, snapshots, the log itself."""
 
 import hashlib
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load, save
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv, parallel_env
 from rlftsim.envs.episode import advance
@@ -193,6 +195,40 @@ def test_snapshots_of_something_else_are_refused(data):
         assert damaged != body
         with pytest.raises(DataError, match="damaged snapshot"):
             env.restore(damaged + hashlib.sha256(damaged).digest())
+    env.restore(saved)
+
+
+def test_a_changed_snapshot_with_a_right_checksum_is_refused_in_one_line():
+    env = EgoEnv(scenarios=[bend()], traffic="replay", stop_on=())
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(2, np.float32))
+    saved = env.snapshot()
+    arrays = load(saved[:-32])
+    motion, about = arrays["motion"], json.loads(arrays["about"].tobytes())
+    scenario_id = about["scenarios"][0]
+    begins_elsewhere, jumps, far = motion.copy(), motion.copy(), motion.copy()
+    begins_elsewhere[0, 0, 0] += 1.0
+    jumps[2:, 0, 1] += 50.0
+    far[2:] *= 1e200
+    for changed_about, changed_motion, cause in (
+        ({"goals": {scenario_id: {"abc": [1, 2]}}}, motion, "abc"),
+        ({"scenarios": []}, motion, "its scenarios cannot be used"),
+        ({"scenarios": [["a"]]}, motion, "its scenarios cannot be used"),
+        ({"dice": [[]]}, motion, "its dice are not of 1 scenarios"),
+        ({"dice": about["dice"] * 2}, motion, "its dice are not of 1 scenarios and 1 decisions"),
+        ({"dice": [5]}, motion, "not iterable"),
+        ({}, motion[:0], "its motion has -1 steps"),
+        ({}, np.repeat(motion, 40, 0), "its motion has 159 steps, not 0 to 80"),
+        ({}, motion.astype(np.float32), "its motion cannot be used"),
+        ({}, far, "its motion cannot be used"),
+        ({}, begins_elsewhere, "does not begin as the log"),
+        ({}, jumps, r"agent \d+ in scenario .* jumps by 50 m at step 2"),
+    ):
+        text = np.frombuffer(json.dumps({**about, **changed_about}).encode(), np.uint8)
+        body = save({"motion": np.ascontiguousarray(changed_motion), "about": text})
+        with pytest.raises(DataError, match=rf"^a damaged snapshot \(.*{cause}.*\): take a new one with snapshot"):
+            env.restore(body + hashlib.sha256(body).digest())
     env.restore(saved)
 
 

@@ -3,6 +3,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -86,11 +87,50 @@ def test_a_shard_is_mapped_and_its_batches_are_as_many_as_its_end_says(tmp_path)
             map_arrow(tmp_path / "cut.arrow", "convert again")
 
 
+def repeat_text(num_rows, num_bytes):
+    text = pa.array(["x" * num_bytes])
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(num_rows, np.int32)), text)
+
+
+@pytest.mark.parametrize(
+    ("column", "settings"),
+    [
+        (repeat_text(20_000, 1_000_000), {"dictionary_pagesize_limit": 1 << 30, "store_schema": False}),
+        (repeat_text(20_000, 1_000_000), {"dictionary_pagesize_limit": 1 << 30, "data_page_version": "2.0"}),
+        (pa.ListArray.from_arrays(pa.array([0, 20_000], pa.int32()), repeat_text(20_000, 1_000_000)), {}),
+        (pa.ListArray.from_arrays(pa.array([0, 30_000_000], pa.int32()), pa.array(np.zeros(30_000_000))), {}),
+        (["y" * 600_000_000], {"use_dictionary": False, "write_statistics": False}),
+        (
+            [f"{'z' * 100_000}{number}" for number in range(6_000)],
+            {"use_dictionary": False, "column_encoding": {"a": "DELTA_BYTE_ARRAY"}},
+        ),
+    ],
+    ids=["texts", "texts-v2", "texts-in-a-list", "a-long-list", "a-long-text", "differences"],
+)  # fmt: skip
+def test_a_small_file_that_unfolds_to_more_than_memory_holds_is_refused(column, settings, tmp_path):
+    pq.write_table(pa.table({"a": column}), tmp_path / "a.parquet", compression="zstd", **settings)
+    before = pa.default_memory_pool().bytes_allocated()
+    with pytest.raises(DataError, match=r"a\.parquet: cannot be read \(it unfolds to .* bytes or more from \d+\): get"):
+        read_parquet(tmp_path / "a.parquet", "get it again")
+    assert pa.default_memory_pool().bytes_allocated() == before
+
+
+def test_texts_that_are_repeated_within_reason_are_read(tmp_path, monkeypatch):
+    names = [f"{'name' * 20}-{number % 3000}" for number in range(200_000)]
+    table = pa.table({"by dictionary": names, "by differences": sorted(names), "in a list": [[name] for name in names]})
+    pq.write_table(
+        table, tmp_path / "a.parquet", use_dictionary=["by dictionary", "in a list.list.element"],
+        column_encoding={"by differences": "DELTA_BYTE_ARRAY"},
+    )  # fmt: skip
+    monkeypatch.setattr("rlftsim.jobs.tables.MAX_BYTES", 80_000_000)
+    assert read_parquet(tmp_path / "a.parquet", "get it again").equals(table)
+
+
 def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tmp_path, monkeypatch):
-    monkeypatch.setattr("rlftsim.jobs.tables.MAX_VALUES", 1000)
+    monkeypatch.setattr("rlftsim.jobs.tables.MAX_BYTES", 1000)
     monkeypatch.setattr(pq.ParquetFile, "read", lambda *_: pytest.fail("it was read"))
     pq.write_table(pa.table({"a": [0] * 1_000_000}), tmp_path / "a.parquet")
-    with pytest.raises(DataError, match=r"announces 1e\+06 values in \d+ bytes"):
+    with pytest.raises(DataError, match=r"unfolds to 2\.4e\+07 bytes or more from \d+"):
         read_parquet(tmp_path / "a.parquet", "write it again")
 
 

@@ -86,7 +86,7 @@ def test_what_is_no_sum_of_rewards_is_refused_in_words(text, words):
 
 def test_the_command_line_sets_a_sum():
     words = ["finetune", "smart-demo", "--model", "m", "--data", "d", "--out", "o", "--finetune.reward"]
-    finetune = parse([*words, "mloo + 0.1*collision_offroad_ade(ade_weight=0.2)"]).settings.finetune
+    finetune = parse([*words, "mloo + 0.1*collision_offroad_ade(ade_weight=0.2)"]).values["recipe"].finetune
     assert finetune.reward == "mloo + 0.1*collision_offroad_ade(ade_weight=0.2)"
     with pytest.raises(ConfigError, match="unknown reward 'joy'"):
         parse([*words, "mloo + joy"])

@@ -2,19 +2,16 @@
 
 import errno
 import fcntl
-import importlib
 import json
 import os
 import shutil
 import threading
 import time
-from typing import get_type_hints
 
 import pytest
 
 from full_disk import limit_files_to
 from rlftsim.cli.main import HAVE_SHARES, main
-from rlftsim.cli.parse import OLD_COMMANDS
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.jobs import folder as folders
@@ -252,12 +249,10 @@ def test_a_share_takes_over_from_a_driver_that_was_stopped(tmp_path):
 
 
 def test_the_commands_that_join_takes_are_those_with_shares():
-    old = {name: place.split(":") for name, place in OLD_COMMANDS.items()}
     annotations = {
-        name: get_type_hints(getattr(importlib.import_module(m), c)).values() for name, (m, c) in old.items()
+        name: [argument.annotation for argument in read_arguments(command.function).values()]
+        for name, command in COMMANDS.items()
     }
-    for name, command in COMMANDS.items():
-        annotations[name] = [argument.annotation for argument in read_arguments(command.function).values()]
     with_shares = {name for name, kinds in annotations.items() if any(kind in (Machines, Work) for kind in kinds)}
     assert with_shares == set(HAVE_SHARES)
 

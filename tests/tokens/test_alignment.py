@@ -9,7 +9,6 @@ import torch
 
 import tiny
 from rlftsim.cli.main import main
-from rlftsim.cli.train import ClassName
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -17,6 +16,7 @@ from rlftsim.recipes.smart import smart_demo_rlftsim
 from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STILL_TOKEN, Vocabulary
+from rlftsim.verbs.pretrain import ClassName
 
 VEHICLE, PEDESTRIAN, CYCLIST = range(3)
 

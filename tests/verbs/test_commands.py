@@ -36,7 +36,7 @@ def test_help_has_each_argument_of_the_function_with_its_text_word_for_word(name
     for argument in arguments.values():
         assert argument.text, argument.name
         assert argument.text[0].isupper() or not argument.text[0].isalpha(), argument.text
-        if argument.settings is None:
+        if argument.settings is None and argument.name not in command.hidden:
             flag = flag_of(command, argument)
             assert re.search(rf"(?<![\w-]){re.escape(flag)}(?![\w-])", words), flag
             # long words such as a path may be cut at a hyphen

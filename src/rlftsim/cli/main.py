@@ -122,8 +122,8 @@ def parse(words: Sequence[str]) -> Any:
     """The verb of a command line with its settings; has a method `run`.
 
     Raises:
-        ConfigError: the words make no sense.
-        SystemExit: they ask for help, which has been printed.
+        ConfigError: The words make no sense.
+        SystemExit: They ask for help, which has been printed.
     """
     for word in words:
         try:

@@ -5,14 +5,9 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
+from rlftsim.verbs.commands import FLAG, list_flags
+
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
-FLAG = re.compile(r"--[A-Za-z][\w.-]*")
-ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
-
-
-def flags_of(words: Sequence[str]) -> list[str]:
-    """Flags among words, without their values, as help texts write them."""
-    return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
 
 
 def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
@@ -33,50 +28,47 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     """One line that says what is wrong with a command line.
 
     Args:
-        words: the words behind the verb.
-        complaint: what tyro printed, a box of lines.
-        help_text: the verb's help, for the flags that exist.
+        words: Words behind the verb.
+        complaint: Output of tyro, a box of lines.
+        help_text: Help of the verb, for the flags that exist.
     """
-    actions = ACTIONS.search(help_text)
-    if actions and words and not words[0].startswith("-"):
-        return explain_action(words, actions[1].split(","))
-    known = list(dict.fromkeys(FLAG.findall(help_text)))
-    for flag in flags_of(words):
-        if flag not in known:
-            near = nearest(flag, known)
+    flags = list(dict.fromkeys(FLAG.findall(help_text)))
+    for flag in list_flags(words):
+        if flag not in flags:
+            near = nearest(flag, flags)
             return f"no flag {flag}: " + (f"did you mean {near}?" if near else "`--help` lists them all.")
     # `--switch yes`: tyro complains about the value alone
     left_over = re.search(r"Unrecognized options: (\S+)", complaint)
     for flag, word in pairwise(words):
         group, dot, last = flag.replace("_", "-").removeprefix("--").rpartition(".")
         off = f"--{group}{dot}no-{last}"
-        if left_over and word == left_over[1] and flag.startswith("--") and off in known:
+        if left_over and word == left_over[1] and flag.startswith("--") and off in flags:
             return f"{flag} is a switch, it takes no value: write {flag} or {off}."
     return _one_line(complaint)
 
 
-def nearest(flag: str, known: Sequence[str]) -> str | None:
-    """The known flag that a mistyped one most likely stands for; None = none is near.
+def nearest(flag: str, flags: Sequence[str]) -> str | None:
+    """The flag that a mistyped one most likely stands for; None = none is near.
 
     Args:
-        flag: e.g. "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".
-        known: flags that exist.
+        flag: Mistyped flag, such as "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".
+        flags: Flags that exist.
     """
     group, _, last = flag.removeprefix("--").rpartition(".")
-    siblings = [name for name in known if name.removeprefix("--").rpartition(".")[0].startswith(group)]
+    siblings = [name for name in flags if name.removeprefix("--").rpartition(".")[0].startswith(group)]
     by_last = {name: name.removeprefix("--").rpartition(".")[2] for name in siblings}
     # 1. the right name without its group, 2. initials, 3. a typing mistake in the last part, 4. one anywhere
-    for fits in (lambda name: name == last, lambda name: "".join(part[:1] for part in name.split("-")) == last):
-        found = next((flag for flag, name in by_last.items() if fits(name)), None)
-        if found:
-            return found
+    for fits in (lambda name: name == last, lambda name: "".join(word[:1] for word in name.split("-")) == last):
+        match = next((flag for flag, name in by_last.items() if fits(name)), None)
+        if match:
+            return match
     close = difflib.get_close_matches(last, list(by_last.values()), n=1, cutoff=0.75)
     if close:
         return next(flag for flag, name in by_last.items() if name == close[0])
     if group and siblings:  # the group is right: a flag of another one would be a wild guess
         return None
     # without the hyphens, which all have in common: "--limit" is not "--split"
-    names = [name.removeprefix("--") for name in known]
+    names = [name.removeprefix("--") for name in flags]
     return next((f"--{name}" for name in difflib.get_close_matches(flag.removeprefix("--"), names, 1, 0.65)), None)
 
 

@@ -18,8 +18,8 @@ LEVEL_M = 1.5
 as much on slopes of 30 %, where boxes that touch may differ in height by more than half the sum of their heights."""
 STEP_UP_M = 1.5
 """Largest step of the ground that an agent follows; beyond it the agent keeps its height."""
-GRADE = 0.15
-"""Height per meter that a slope beside a route may gain."""
+GRADE, FLAT_M = 0.15, 2.0
+"""Height per meter that a slope beside a route may gain, farther from it than its points are apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,8 @@ class RouteHeights:
         """
         is_near_route = self.distance < distances
         rise = np.where(is_near_route, self.above_route - above_route[:, None], self.z - ground[:, None])
-        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, distances), 0.0)
+        beside = np.maximum(np.minimum(self.distance, distances) - FLAT_M, 0.0)
+        return np.maximum(np.abs(rise) - GRADE * beside, 0.0)
 
 
 def is_on_level(difference: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:

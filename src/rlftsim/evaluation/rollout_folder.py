@@ -14,7 +14,7 @@ from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.goals.goals_file import GoalsFile
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
@@ -84,7 +84,7 @@ def simulate_folder(
         _check_identity(out, identity, is_alone=lease.is_alone)  # another share may have begun at the same moment
         task = partial(_simulate_scenario, simulation, out)
         paths = run_items("simulate", scenario_ids, task, format=rollouts, lease=lease, runner=runner)
-        remove_temporaries_below(out)  # of processes that were killed
+        remove_temporaries([out / ABOUT, *paths])  # of processes that were killed
         lease.remove()
     return paths
 

@@ -48,7 +48,7 @@ def _write_lines(section: Any, indent: str) -> Iterator[str]:
             yield f"{indent}{field.name}: {json.dumps(to_plain(value))}"
 
 
-def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
+def read_flags(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
     """Settings of a file as flags of the command line, which checks the values.
 
     Args:
@@ -89,11 +89,11 @@ def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_secti
         if name.partition(".")[0] in sections:
             group, _, last = name.rpartition(".")
             owner = attrgetter(group)(recipe)
-            words += flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
+            words += to_flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
     return words
 
 
-def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
+def to_flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
     """A setting as words of the command line.
 
     Args:

@@ -118,17 +118,32 @@ def finetune_model(
         CheckpointError: `out` holds a run with other settings or a different base model.
         ConfigError: the base model has no weights or other goal conditioning, or the method has no validation.
     """
-    policy: Any = load_policy(str(base))
+    policy = load_policy(str(base))
     if conditioning is not None:
-        if not isinstance(policy, ConditionablePolicy):
-            raise ConfigError(f"{base}: {not_conditioned(policy)}")
-        torch.manual_seed(config.seed)  # of the weights that encode goals; the base model brings the others
-        policy = policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
+        policy = with_conditioning(policy, conditioning, config.seed, name=base)
 
     description = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
     card = model_card(description, training.folder, len(training), base)
     policy = prepare_policy(policy, config)
     return train_policy(policy, training, out, config, held_out=held_out, card=card)
+
+
+def with_conditioning(policy: Any, conditioning: GoalConditioning, seed: int, *, name: object) -> Any:
+    """The policy with goal conditioning.
+
+    Args:
+        policy: Base model, whose weights are kept.
+        conditioning: Goal conditioning to add.
+        seed: Seed of the weights that encode goals.
+        name: Name of the base model, for the message.
+
+    Raises:
+        ConfigError: The policy cannot follow goals.
+    """
+    if not isinstance(policy, ConditionablePolicy):
+        raise ConfigError(f"{name}: {not_conditioned(policy)}")
+    torch.manual_seed(seed)
+    return policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
 
 
 def describe_method(config: object) -> str:

@@ -19,12 +19,13 @@ from pathlib import Path
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
 from rlftsim.jobs.documents import parse_json, read_json
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import check_result_file, remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, check_name
 from rlftsim.jobs.items import ResultFormat, run_items
 from rlftsim.jobs.runner import Runner, check_finished, choose_runner, select_items, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
+    INDEX,
     MANIFEST,
     SHARDS,
     Manifest,
@@ -229,8 +230,10 @@ def convert(
             shards.read(task)  # refuses those of other shares that were read with other settings
     # The folder is marked as unfinished until the mark is removed.
     with Lease(folder / INCOMPLETE, runner, "is converting to", _INCOMPLETE_TEXT) as lease:
+        outputs = [folder / name for task in tasks for name in (task.shard, f"{task.shard}.json")]
+        outputs += [folder / INDEX, folder / MANIFEST]
         if lease.is_alone:
-            remove_temporaries_below(folder)
+            remove_temporaries(outputs)
         finished = _find_finished(folder)
         outcomes = run_items(
             "convert", [replace(task, finished=finished.get(task.shard)) for task in tasks],
@@ -239,7 +242,7 @@ def convert(
         )  # fmt: skip
         num_changed = sum(not task.agrees(outcome.entry) for task, outcome in zip(tasks, outcomes))
         check_finished(runner, num_changed, len(tasks), "convert")  # sources that changed meanwhile
-        remove_temporaries_below(folder)  # of processes that were killed
+        remove_temporaries(outputs)  # of processes that were killed
         earlier = _earlier_manifest(folder)
         manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note, lease)
         lease.remove()
@@ -251,6 +254,7 @@ def _find_finished(folder: Path) -> dict[str, _FinishedShard]:
     earlier = _earlier_manifest(folder)
     shards = {entry.file: _FinishedShard(entry, earlier.provenance) for entry in earlier.shards}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
+        check_result_file(path)
         with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
             receipt = read_json(path, "convert again")
             settings = receipt.pop("settings")

@@ -196,7 +196,7 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
         detail = f"lane {lane} has {count[entries[0]]} different states at step {step}{_format_repeats(len(entries))}"
         yield Finding(Problem.CONTRADICTORY_LIGHTS, scenario_id, detail)
 
-    contradictions = describe_contradictions(tracks)
+    contradictions = describe_contradictions(tracks, scenario.map_features, scenario.guessed)
     if contradictions:
         yield Finding(Problem.CONTRADICTORY_MOTION, scenario_id, contradictions)
 

@@ -14,7 +14,7 @@ from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
 
 _SPLIT = re.compile(r"training|validation|testing")
-CONTRADICTORY = "scenarios whose velocities or headings contradict their positions: `rlftsim data verify` names them"
+CONTRADICTORY = "scenarios whose velocities, headings or heights contradict the rest: `rlftsim data verify` names them"
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def read_unit(
                 except DataError as error:
                     item = SkippedRecord(unit.name, record, str(error))
             if isinstance(item, Scenario):
-                if describe_contradictions(item.tracks):
+                if describe_contradictions(item.tracks, item.map_features, item.guessed):
                     tally(Tally(CONTRADICTORY, 1))
                 yield record, item
             elif on_error == "stop":

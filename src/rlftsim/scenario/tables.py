@@ -188,11 +188,11 @@ def _read_scenario(row: Rows, tables: Mapping[str, Rows]) -> Scenario:
     if ego < 0 or not tracks.valid[ego, CURRENT_STEP]:
         raise row.error(0, f"no ego: object {ego_id} is not there 1 s after step {first_step}, the current step")
     _check_edge_directions(map_rows, map_features)
-    contradictions = describe_contradictions(tracks)
+    contradictions = describe_contradictions(tracks, map_features, guessed)
     if contradictions:
         raise DataError(
             f"{TRACKS}: {contradictions}: vx and vy are m/s along x and y of the same frame, headings radians "
-            f"counter-clockwise from +x, and step_s in {SCENARIOS} the seconds between two steps"
+            f"counter-clockwise from +x, z m as the map's, and step_s in {SCENARIOS} the seconds between two steps"
         )
     predicted = _find_indices(row, "predict", tracks)
     if predicted is None:

@@ -202,7 +202,7 @@ class TrainingRun:
                 f"{self.num_updates} updates: raise epochs again to go on with it, or name another --out.{shorter}"
             )
         if newest:
-            progress = read_checkpoint(newest, learner.modules, learner.optimizer)
+            progress = read_checkpoint(newest, learner.modules, learner.optimizer, learner.to_numbers())
             learner.update = progress.update
             learner.load_numbers(progress.numbers)
         # Metrics of updates behind the checkpoint would appear twice.

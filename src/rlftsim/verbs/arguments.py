@@ -6,18 +6,27 @@
 import os
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
+import tyro
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rlftsim.evaluation.drive_results import DriveResult
     from rlftsim.evaluation.results import Evaluation
     from rlftsim.goals.types import Goals, PointById
+    from rlftsim.recipes.base import Recipe
     from rlftsim.rollout.policy import Policy
     from rlftsim.rollout.types import Rollouts
     from rlftsim.scenario.any_form import AnyScenarios
+    from rlftsim.tokens.clustering import TokensConfig
+    from rlftsim.training.method import TrainingSettings
 
     Model: TypeAlias = Policy | str | os.PathLike[str]
     Data: TypeAlias = AnyScenarios
+    ModelOrRecipe: TypeAlias = Model | Recipe
+    AnyRecipe: TypeAlias = Recipe | str | os.PathLike[str]
+    RecipeOption: TypeAlias = AnyRecipe
+    Settings: TypeAlias = TrainingSettings | TokensConfig
     File: TypeAlias = str | os.PathLike[str]
     Name: TypeAlias = str | os.PathLike[str]
     Metric: TypeAlias = str | int
@@ -28,8 +37,10 @@ if TYPE_CHECKING:
 else:
     from pathlib import Path
 
-    Model = Data = Name = Metric = Annotated[Any, str]
-    File = GoalPoints = Simulated = Result = Annotated[Any, Path]
+    Model = Data = Name = Metric = ModelOrRecipe = AnyRecipe = Annotated[Any, str]
+    RecipeOption = Annotated[Any, Annotated[str, tyro.conf.arg(metavar="RECIPE")]]
+    File = Settings = GoalPoints = Simulated = Result = Annotated[Any, Path]
     ScoreMetric = Annotated[Any, Literal["2025", "2024", "2024_original_code", "2023"]]
 
 Device = Literal["auto", "cpu", "cuda"]
+Processes = Annotated[int | Literal["auto"] | None, tyro.conf.arg(metavar="INT|auto")]

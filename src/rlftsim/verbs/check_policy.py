@@ -14,7 +14,7 @@ def check_policy(policy: Model, scenarios: Data, *, reference: Model | None = No
 
     Args:
         policy: Policy, or a name for `load_policy`.
-        scenarios: At least one scenario, on which everything is tried; best of different sizes and with all kinds of
+        scenarios: Scenarios, one or more, on which everything is tried; best of different sizes and with all kinds of
             agents. A name of a data set stands for its split validation.
         reference: Another policy of the same kind for KL divergences; None = a copy with perturbed weights.
 

@@ -4,7 +4,7 @@ import inspect
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
@@ -13,6 +13,7 @@ import tyro
 from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 
 NO_DEFAULT = inspect.Parameter.empty
+FLAG = re.compile(r"--[A-Za-z][\w.-]*")
 
 
 @dataclass(frozen=True)
@@ -30,26 +31,42 @@ class Command:
     show: str | None = None
     """Name of the function in the same module that prints the result. It takes arguments of the verb by name, and may
     have further ones, which are flags too. It may return the exit status, as a verb without this function does."""
+    sections: Sequence[str] = ()
+    """Sections of a recipe whose fields are flags. A function `adapt_flags` in the same module may change them for a
+    command line, and `check_flags` refuses what has no effect."""
+    recipe: str = "recipe"
+    """Argument that takes the recipe with the values of these flags, in place of its name."""
+    hidden: Sequence[str] = ()
+    """Arguments that only Python takes."""
+
+    @property
+    def module(self) -> str:
+        """Name of the verb's module."""
+        return self.location.partition(":")[0]
 
     @property
     def function(self) -> Callable[..., Any]:
         """The verb."""
-        module, _, name = self.location.partition(":")
-        return getattr(import_module(module), name)
+        return getattr(import_module(self.module), self.location.partition(":")[2])
 
     @property
     def printer(self) -> Callable[..., Any] | None:
         """The function that prints the result; None where the verb prints."""
-        return getattr(import_module(self.location.partition(":")[0]), self.show) if self.show else None
+        return getattr(import_module(self.module), self.show) if self.show else None
 
-    def parser(self) -> Callable[..., "Call"]:
-        """A function for tyro, which reads its signature; makes the call of a command line."""
+    def parser(self, settings: Mapping[str, Any]) -> Callable[..., "Call"]:
+        """A function for tyro, which reads its signature; makes the call of a command line.
+
+        Args:
+            settings: Settings by section, which become flags behind those of the verb.
+        """
         function, printer = self.function, self.printer
-        arguments = read_arguments(function)
+        arguments = {name: argument for name, argument in read_arguments(function).items() if name not in self.hidden}
         if printer is not None:
             options = list(read_arguments(printer).values())[1:]  # behind the result
             arguments |= {option.name: option for option in options if option.name not in arguments}
         parameters = [self._parameter(arguments[name]) for name in (*self.positional, *arguments)]
+        parameters += [Argument(name, Any, section, "").to_parameter() for name, section in settings.items()]
         parameters = list({parameter.name: parameter for parameter in parameters}.values())
         return with_parameters(lambda **values: Call(self, values), describe(function), parameters)
 
@@ -75,7 +92,7 @@ class Call:
     def run(self) -> int:
         """Call the verb and print its result; returns the exit status."""
         verb, printer = self.command.function, self.command.printer
-        result = verb(**{name: self.values[name] for name in inspect.signature(verb).parameters})
+        result = verb(**{name: self.values[name] for name in inspect.signature(verb).parameters if name in self.values})
         if printer is not None:
             _, *options = inspect.signature(printer).parameters
             result = printer(result, **{name: self.values[name] for name in options})
@@ -96,8 +113,11 @@ class Argument:
         """Settings whose fields become flags, with their defaults; None for any other argument."""
         if is_dataclass(self.default):
             return self.default
-        kinds = get_args(self.annotation) or (self.annotation,)
-        return next((kind() for kind in kinds if isinstance(kind, type) and is_dataclass(kind)), None)
+        choices = get_args(self.annotation) or (self.annotation,)
+        return next(
+            (cls() for cls in choices if isinstance(cls, type) and is_dataclass(cls)),
+            None,
+        )
 
     def to_parameter(self, *markers: Any) -> inspect.Parameter:
         """The argument as tyro reads it, its text on one line; settings become the flags of their fields.
@@ -146,32 +166,13 @@ def settings_parser(settings: Any) -> Callable[..., Any]:
     Args:
         settings: Dataclass; fields that are dataclasses become groups of flags.
     """
-    kind = type(settings)
-    hints, texts = get_type_hints(kind, include_extras=True), read_field_texts(kind)
+    cls = type(settings)
+    hints, texts = get_type_hints(cls, include_extras=True), read_field_texts(cls)
     arguments = [
         Argument(field.name, hints[field.name], getattr(settings, field.name), texts.get(field.name, ""))
         for field in fields(settings)
     ]
-    return with_parameters(kind, summarize_docstring(kind), [argument.to_parameter() for argument in arguments])
-
-
-def dataclass_parser(verb: type[Any]) -> Callable[..., Any]:
-    """A function for tyro that makes a verb which is a dataclass still, its texts on one line each.
-
-    Args:
-        verb: Dataclass, or one made from it with further fields for the sections of a recipe.
-    """
-    hints, written = get_type_hints(verb, include_extras=True), [kind for kind in verb.__mro__ if is_dataclass(kind)]
-    texts = read_field_texts(written[1] if hasattr(verb, "starting_name") else verb)
-    arguments = []
-    for entry in fields(verb):
-        default = entry.default if entry.default_factory is MISSING else entry.default_factory()
-        arguments.append(
-            Argument(
-                entry.name, hints[entry.name], NO_DEFAULT if default is MISSING else default, texts.get(entry.name, "")
-            )
-        )
-    return with_parameters(verb, describe(verb), [argument.to_parameter() for argument in arguments])
+    return with_parameters(cls, summarize_docstring(cls), [argument.to_parameter() for argument in arguments])
 
 
 def with_parameters(
@@ -194,10 +195,15 @@ def with_parameters(
     return parser
 
 
+def list_flags(words: Sequence[str]) -> list[str]:
+    """Flags among words, without their values, as help texts write them."""
+    return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
+
+
 def without_none(annotation: Any) -> Any:
     """A type without None, which nobody gives where a value is required."""
-    kinds = [kind for kind in get_args(annotation) if kind is not types.NoneType]
-    return Union[tuple(kinds)] if get_origin(annotation) in (Union, types.UnionType) else annotation  # noqa: UP007
+    choices = [cls for cls in get_args(annotation) if cls is not types.NoneType]
+    return Union[tuple(choices)] if get_origin(annotation) in (Union, types.UnionType) else annotation  # noqa: UP007
 
 
 def to_flag_type(annotation: Any) -> Any:
@@ -210,6 +216,7 @@ def to_flag_type(annotation: Any) -> Any:
 
 
 FOLDER, MODEL = {"destination": "FOLDER"}, {"policy": "MODEL"}
+FINETUNING = ("finetune", "catk", "road", "gcsl", "calibrate")
 COMMANDS = {
     "demo": Command("rlftsim.verbs.demo:demo"),
     "doctor": Command("rlftsim.verbs.doctor:doctor"),
@@ -221,6 +228,15 @@ COMMANDS = {
     "data pull": Command("rlftsim.verbs.data:pull", ("url", "folder")),
     "synthesize": Command("rlftsim.verbs.synthesize:synthesize", ("destination",), names=FOLDER),
     "recipe": Command("rlftsim.verbs.recipe:recipe", ("name",), show="print_recipe"),
+    "tokens": Command("rlftsim.verbs.tokens:tokens", sections=("tokens",)),
+    "pretrain": Command(
+        "rlftsim.verbs.pretrain:pretrain", ("policy",), ("out",), {"policy": "RECIPE", "scenarios": "data"},
+        "print_model", ("model", "pretrain"), recipe="policy", hidden=("held_out",),
+    ),
+    "finetune": Command(
+        "rlftsim.verbs.finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
+        "print_model", FINETUNING,
+    ),
     "augment": Command("rlftsim.verbs.augment:augment", ("model",)),
     "model show": Command("rlftsim.verbs.model:show_model", ("model",)),
     "model average": Command("rlftsim.verbs.model:average_models", ("models",)),
@@ -241,8 +257,11 @@ COMMANDS = {
     "submit build": Command("rlftsim.verbs.submit:build", ("model",)),
     "submit check": Command("rlftsim.verbs.submit:check", ("archive",)),
     "submit info": Command("rlftsim.verbs.submit:info", ("archive",)),
+    "experiment": Command(
+        "rlftsim.verbs.experiment:experiment", ("name",), sections=("tokens", "model", "pretrain", *FINETUNING)
+    ),
     "experiment exam": Command("rlftsim.verbs.exam:exam"),
-}
+}  # fmt: skip
 """Verbs, and actions of verbs such as "data verify"."""
 ACTIONS = {
     "data": "Check a data set for damage, print its statistics, or copy it to a bucket and back.",

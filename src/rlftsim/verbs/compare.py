@@ -25,7 +25,7 @@ def compare(a: Result, b: Result, *, alpha: float = 0.05) -> Comparison | DriveC
     Differences are b minus a.
 
     Args:
-        a: The reference, such as the base model: a result of `evaluate`, or a parquet file that `rlftsim evaluate` or
+        a: Reference, such as the base model: a result of `evaluate`, or a parquet file that `rlftsim evaluate` or
             `rlftsim drive` wrote.
         b: Another one on the same scenarios, such as that of the fine-tuned model.
         alpha: Significance level: probability of calling a difference that is none.

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Machines, usable_cores
 from rlftsim.scenario.convert import convert as convert_source
 from rlftsim.scenario.tfrecord import count_lost
@@ -28,8 +29,8 @@ def convert(
     An interrupted conversion continues when the same command is repeated. The sources are not needed afterwards.
 
     Args:
-        source: For WOMD a tfrecord shard, a folder of shards, or a quoted glob such as 'training/*tfrecord*'.
-            For other sources a folder.
+        source: WOMD tfrecord shard, folder of shards, or quoted glob such as 'training/*tfrecord*'; of other sources
+            a folder.
         destination: Folder of the data set.
         reader: Format of the source: womd, av2 (Argoverse 2 motion forecasting), tables (Parquet tables of your
             own recordings), or the name of a data source of another package (docs/extending.md). auto:
@@ -40,8 +41,7 @@ def convert(
         window: Steps of av2 only: the 91 of 110 steps that are taken, last (the default), first, or both as two
             scenarios. av2: 71 steps around the data set's own current step, which cannot be scored.
         keep_other: Keep, of av2 only, static objects, construction and the like as objects of no particular type.
-        sizes: For av2 only: JSON file with length, width and height in meters by kind, in place of the guessed
-            ones.
+        sizes: JSON file with length, width and height in meters by kind, in place of the guessed ones; av2 only.
         machines: Machines that share the work.
     """
     options = {"window": window, "keep_other": keep_other or None, "sizes": sizes}
@@ -57,12 +57,12 @@ def convert(
     )
     by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
     counts = f"{report.converted} scenarios converted, {count_lost(report.skipped)} lost"
-    print(f"{report.destination}: {counts}; in all {by_split}.")
+    print_line(f"{report.destination}: {counts}; in all {by_split}.")
     for subject, count in report.tallies.items():
-        print(f"  {count} {subject}")
+        print_line(f"  {count} {subject}")
     # A damaged shard can lose thousands of records: the first ones are listed.
     for record in [*report.skipped, *report.duplicates][:MAX_LISTED]:
-        print(f"  left out: {record.file}, record {record.record}: {record.cause}")
+        print_line(f"  left out: {record.file}, record {record.record}: {record.cause}")
     num_hidden = len(report.skipped) + len(report.duplicates) - MAX_LISTED
     if num_hidden > 0:
         print(f"  ... and {num_hidden} more")

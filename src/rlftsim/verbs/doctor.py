@@ -84,7 +84,7 @@ def _versions() -> Iterator[Diagnosis]:
         ("Python", platform.python_version(), (3, 11)),
         ("torch", torch.__version__, (2, 10)),
     ):
-        number = tuple(int(part) for part in version_text.split("+")[0].split(".")[:2])
+        number = tuple(int(digits) for digits in version_text.split("+")[0].split(".")[:2])
         if number >= oldest:
             yield Diagnosis(software, GOOD, version_text)
         else:

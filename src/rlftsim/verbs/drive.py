@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from rlftsim.evaluation.drive_results import format_drives
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 
 
 def drive(
@@ -37,7 +37,7 @@ def drive(
         split: Split of the data set.
         traffic: Drivers of the other agents, separated by commas: policy, replay, constant_velocity, idm.
         scenario: Ids of the scenarios to drive; left out, all of the split.
-        limit: Only the first LIMIT scenarios.
+        limit: Number of scenarios, the first ones of the data set; left out, all of them.
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.
         seed: Seed of the traffic. The same seed gives every planner the same dice.
         jobs: Processes, each with one thread. Changes no result.
@@ -57,7 +57,7 @@ def drive(
     results = driving.drive(config, out)
     print_wide(format_drives(*results))
     for scenario_id, reasons in results[0].missing.items():
-        print(f"  {scenario_id}: {'; '.join(f'no {name}, {reason}' for name, reason in reasons.items())}")
+        print_line(f"  {scenario_id}: {'; '.join(f'no {name}, {reason}' for name, reason in reasons.items())}")
     if film:
         print(driving.film(config, out))
     print(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")

@@ -10,7 +10,7 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.jobs.buckets import validate_folder
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -47,7 +47,7 @@ def evaluate(
     is repeated.
 
     Args:
-        policy: A run, a model folder, a registered name such as "constant_velocity", or "oracle" (the log itself: the
+        policy: Run, model folder, registered name such as "constant_velocity", or "oracle" (the log itself: the
             ceiling). In Python also a policy.
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package. In Python also an
             opened data set or scenarios in any other form.
@@ -56,7 +56,7 @@ def evaluate(
         out: Folder for the results. In Python they may be in memory alone.
         num_rollouts: Rollouts per scenario; the official metric is defined for 32.
         seed: Seed of all randomness. The same seed gives the same scores.
-        limit: Only the first so many scenarios.
+        limit: Number of scenarios, the first ones of the data set; left out, all of them.
         metric: Year of the meta-metric.
         sampling: Temperature and truncation of the decisions; left out, the whole distribution is sampled.
         goals: Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model.
@@ -122,5 +122,5 @@ def print_evaluation(result: Evaluation, *, out: Path) -> None:
         raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
     print_wide(format_table(result))
     for skipped in result.skipped:
-        print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
+        print_line(f"  skipped {skipped.scenario_id}: {skipped.reason}")
     print(f"{out / result.name}.parquet")

@@ -1,165 +1,181 @@
-"""Public `pretrain` and `finetune`: training that leaves the given policy as it is."""
+"""`rs.finetune` and `rlftsim finetune`: training in closed loop that leaves the given policy as it is."""
 
-import copy
 import os
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
-from torch import nn
+import tyro
 
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
-from rlftsim.recipes.card import append_cards, model_card
-from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.recipes.train import describe_method, prepare_policy
-from rlftsim.rollout.policy import Policy, get_device
-from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.types import Scenarios
-from rlftsim.tokens.clustering import build_vocabulary
+from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
+from rlftsim.rollout.policy import Policy
+from rlftsim.scenario.any_form import to_scenarios
 from rlftsim.training.calibrate import CalibrateConfig
-from rlftsim.training.catk import CatkConfig
+from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.goal_relabeling import NOT_VALIDATED, GcslConfig
 from rlftsim.training.imitation import PretrainConfig
-from rlftsim.training.registry import find_method
-from rlftsim.training.run import train_policy
-from rlftsim.verbs.inputs import to_policy
+from rlftsim.training.registry import METHODS, find_method, method_by_name
+from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, Processes, Settings
+from rlftsim.verbs.inputs import check_config, to_recipe
+from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
+from rlftsim.verbs.training import find_held_out, load_start, print_model, train, with_processes, write_card
+
+__all__ = ["adapt_flags", "check_flags", "finetune", "print_model"]
 
 
-def pretrain(
-    policy: Policy | Recipe | Name,
-    scenarios: AnyScenarios,
-    out: Name | None = None,
-    config: PretrainConfig | None = None,
-    *,
-    held_out: AnyScenarios | None = None,
-) -> Policy:
-    """Pre-train a policy to predict the next decision along logged tracks, and return a new one.
+def adapt_flags(flags: RecipeFlags, words: Sequence[str]) -> RecipeFlags:
+    """The flags with those of the method, of a recipe with goals if there are some.
 
     Args:
-        policy: a recipe or its name, for a policy with fresh weights and a vocabulary built from the scenarios. Or a
-            policy, or a name for `load_policy`, whose weights are trained further; it stays as it is.
-        scenarios: training scenarios with their logged futures; a name of a data set stands for its split training.
-        out: folder of the run; an interrupted run goes on there, a finished one is not repeated. None keeps no files.
-        config: settings; None stands for those of the recipe, or the defaults.
-        held_out: scenarios for validation in closed loop, see `config.validation`; a name of a data set stands for its
-            split validation.
+        flags: Flags of the recipe.
+        words: Words behind the command.
+    """
+    method = find_value("--method", words) or "rlft"
+    section = find_section(method)
+    sections = tuple(dict.fromkeys((*flags.sections, section)))
+    recipe = _complete_recipe(flags.recipe, section, has_goals=bool(find_value("--goal", words)))
+    return replace(flags, recipe=recipe, sections=sections, file_sections=sections, run_section=section)
 
-    Returns:
-        The pre-trained policy, ready to simulate.
+
+def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str]) -> None:
+    """Check that there are no settings of other methods, and no flags that need another flag.
+
+    Args:
+        values: Values of the command line by argument.
+        recipe: Recipe with the values of its flags.
+        flags: Flags that were given.
 
     Raises:
-        ConfigError: the policy cannot be pre-trained, no scenario, or no such recipe.
-        DataError: no such data set, or it has no such split.
-        CheckpointError: `out` holds another run, or the run diverged.
-        NotYetError: another run is at work in `out`.
+        ConfigError: A flag has no effect, or the recipe has no settings of the method.
     """
-    _require_config(config, "pretrain", PretrainConfig)
-    training = to_scenarios(scenarios, "training")
-    if isinstance(policy, str) and policy in RECIPES.names():
-        policy = recipe_by_name(policy)
-    if isinstance(policy, Recipe):
-        config = config or policy.pretrain
-        vocabulary = None if policy.tokens is None else build_vocabulary(training, policy.tokens)[0]
-        start: Any = policy.new_policy(vocabulary)
-        card = _card("pre-trained", training)
-    else:
-        start = to_policy(policy)
-        card = _card("pre-trained further", training, policy)
-    settings = config or PretrainConfig()
-    validation = None if held_out is None else to_scenarios(held_out)
-    return _train_copy(
-        start,
-        out,
-        lambda learner, folder: train_policy(learner, training, folder, settings, held_out=validation, card=card),
-    )
+    method, goal, bias = values["method"], values["goal"], values["goal_logit_bias"]
+    section = find_section(method)
+    others = [name for name in ("finetune", "catk", "road", "gcsl", "calibrate") if name != section]
+    check_no_settings(flags, others, f"with --method {method}: its settings are --{section}.*")
+    if goal is None and bias is not None:
+        flag = "--goal-logit-bias" if bias else "--no-goal-logit-bias"
+        raise ConfigError(f"{flag} has no effect without goals: add --goal concat or --goal indication.")
+    if method == "gcsl" and values["validation_split"]:
+        raise ConfigError(f"--validation-split {values['validation_split']} has no effect: {NOT_VALIDATED}")
+    _find_settings(recipe, values["recipe"], method)
 
 
 def finetune(
-    policy: Policy | Name,
-    scenarios: AnyScenarios,
-    out: Name | None = None,
-    config: Any = None,
+    policy: Model,
+    scenarios: Data,
+    out: File | None = None,
+    config: Settings | None = None,
+    *,
+    recipe: AnyRecipe | None = None,
+    method: Annotated[str, tyro.conf.arg(metavar="rlft|catk|road|gcsl|calibrate|NAME")] = "rlft",
+    goal: Literal["concat", "indication"] | None = None,
+    goal_logit_bias: Annotated[bool | None, tyro.conf.arg(metavar="/ --no-goal-logit-bias")] = None,
+    processes: Processes = None,
+    split: str = "training",
+    validation_split: str | None = None,
 ) -> Policy:
-    """Fine-tune a policy in closed loop, and return a new one; the given policy stays as it is.
+    """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), by CAT-K, by RoaD or by
+    calibration.
 
-    Equals `rlftsim finetune` with the same settings.
+    Example: rlftsim finetune smart-tiny --model runs/base --data data/womd --out runs/tuned --finetune.epochs 0.5
+
+    Writes checkpoints, metrics and the finished model, OUT/model. An interrupted run continues when the same
+    command is repeated.
 
     Args:
-        policy: a policy, or a name for `load_policy`.
-        scenarios: training scenarios with their logged futures; a name of a data set stands for its split training.
-        out: folder of the run; an interrupted run goes on there, a finished one is not repeated, and with a reward and
-            more epochs it is trained further. None keeps no files.
-        config: settings, such as `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`; those
-            of a recipe's `catk`, `gcsl` or `calibrate` choose that method, and so do those of a method of another
-            package. None stands for the paper's settings.
+        policy: Model to start from: a run, a model folder or a registered name. rlft also uses it as the frozen KL
+            reference. In Python also a policy, which stays as it is.
+        scenarios: Folder of a data set, or "synthetic" for the scenarios that ship with the package. In Python also
+            scenarios with their logged futures.
+        out: Folder of the run: configuration, metrics, checkpoints, model. A finished run is not repeated; with a
+            reward and more epochs it is trained further. In Python left out, no file is kept.
+        config: JSON file of settings: the output of `rlftsim recipe NAME --json`, or the config.json of an earlier run
+            by the same method. A run repeated from its own config.json, with the same model and data, gives the same
+            weights bit for bit. Flags override the file. In Python settings such as
+            `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`, in place of the recipe's;
+            their class says the method.
+        recipe: Settings to start from; `rlftsim recipe` lists all recipes. The flags below change single fields. The
+            model brings its own architecture, so any recipe fits any model. In Python also a recipe itself; left out,
+            the paper's settings.
+        method: Training method. rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised
+            fine-tuning along rollouts that choose the token closest to the log among the top K, fields catk.*. road:
+            supervised fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the
+            goal-conditioned weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft
+            with goals (--model OUT), fields gcsl.*. calibrate: fit the weights of a few named features on the token
+            logits, no weight of the model, to a realism reward without a change of speed, fields calibrate.*. Another
+            NAME: the method that another package has registered, fields NAME.*.
+        goal: Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
+            --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
+            weights alone. Left out, the model keeps the goal conditioning it has.
+        goal_logit_bias: With --goal: add a goal-progress bias to the token logits (ours, not the paper's). Left out:
+            yes where goal conditioning is added, unchanged where the model has it.
+        processes: Processes that train, in short for the method's device.processes.
+        split: Split of the data set to train on.
+        validation_split: With catk and road: split to validate on in closed loop, see --catk.validation.every. Left
+            out: "validation", if the data set has it.
 
     Returns:
         The fine-tuned policy, ready to simulate.
 
     Raises:
-        ConfigError: a policy without weights, or no scenario.
-        DataError: no such data set, or it has no split training.
-        CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
-        NotYetError: another run is at work in `out`.
+        ConfigError: A policy without weights, no scenario, or settings of no method.
+        DataError: No such data set, or it has no such split.
+        CheckpointError: The folder holds another run, or the run diverged (the message names its last good checkpoint).
+        NotYetError: Another run is at work in the folder.
     """
-    settings = FinetuneConfig() if config is None else config
-    if isinstance(settings, PretrainConfig) or find_method(settings) is None:
-        _require_config(settings, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
-    training = to_scenarios(scenarios, "training")
-    card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
-    start = prepare_policy(to_policy(policy), settings)
-    return _train_copy(start, out, lambda learner, folder: train_policy(learner, training, folder, settings, card=card))
+    if isinstance(config, PretrainConfig) or find_method(config) is None:
+        check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
+    training = to_scenarios(scenarios, split)
+    settings: Any = config
+    if settings is None:
+        base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
+        # a recipe that is handed over has what it should have
+        if not isinstance(recipe, Recipe):
+            base = _complete_recipe(base, find_section(method), has_goals=goal is not None)
+        settings = _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
+    settings = with_processes(settings, processes)
+    trainer = find_method(settings)
+    every = settings.validation.every if trainer is not None and trainer.validates else 0
+    held_out = find_held_out(scenarios, validation_split, every)
+    learner, device = load_start(policy)
+    conditioning = "" if goal is None else GoalConditioning(goal, goal_logit_bias)
+    if conditioning:
+        name = policy if isinstance(policy, str | os.PathLike) else type(policy).__name__
+        learner = with_conditioning(learner, conditioning, settings.seed, name=name)
+    card = write_card(f"fine-tuned ({describe_method(settings)}{conditioning})", training, policy)
+    learner = prepare_policy(learner, settings)
+    return train(learner, training, out, settings, held_out=held_out, card=card, device=device)
 
 
-def _require_config(config: object, section: str, *kinds: type) -> None:
-    """Refuse settings of another kind, mostly a whole recipe.
-
-    Args:
-        config: None or settings.
-        section: of a recipe, for the message.
-        kinds: settings that are taken.
+def find_section(method: str) -> str:
+    """Section of a recipe with the settings of a method of fine-tuning: "finetune" for rlft, else the method's name.
 
     Raises:
-        ConfigError: settings of no such kind.
+        ConfigError: Unknown, with the nearest known name, or "pretrain", which is no fine-tuning.
     """
-    if not isinstance(config, (*kinds, type(None))):
-        *most, last = (kind.__name__ for kind in kinds)
-        names = f"{', '.join(most)} or {last}" if most else last
-        raise ConfigError(
-            f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."
-        )
+    if method == "pretrain":
+        raise ConfigError("method 'pretrain' has a command of its own: rlftsim pretrain --init-from MODEL.")
+    METHODS.get(method)
+    return "finetune" if method == "rlft" else method
 
 
-def _train_copy(policy: Policy, out: Name | None, train: Callable[[Any, Path], object]) -> Any:
-    """A trained copy of a policy, on the policy's device.
+def _complete_recipe(recipe: Recipe, section: str, *, has_goals: bool) -> Recipe:
+    """The recipe with the settings of a method of another package, and with goals."""
+    if not hasattr(recipe, section):
+        recipe = recipe.with_section(section, method_by_name(section).settings())
+    return recipe.with_goals() if has_goals else recipe
 
-    Args:
-        policy: stays as it is.
-        out: folder of the run; None = a temporary one.
-        train: trains a policy in place with a folder for its files.
+
+def _find_settings(recipe: Recipe, name: object, method: str) -> Any:
+    """Settings of a method, of a recipe with this name.
+
+    Raises:
+        ConfigError: The recipe has none.
     """
-    # Without weights there is nothing to copy; `train` refuses such a policy with a message.
-    # Weights of a loaded policy are frozen; each method freezes again what it does not train.
-    learner = copy.deepcopy(policy).requires_grad_(True) if isinstance(policy, nn.Module) else policy
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
-            train(learner, Path(folder))
-    else:
-        train(learner, Path(out))
-    assert isinstance(learner, nn.Module)
-    return learner.eval().requires_grad_(False).to(get_device(policy))
-
-
-def _card(what: str, scenarios: Scenarios, start: Policy | Name | None = None) -> str:
-    """README of the model folder; terms are known of data sets and of starts that have a name."""
-    name = start if isinstance(start, str | os.PathLike) else None
-    if start is not None:
-        what = f"{what} from {name or type(start).__name__}"
-    if isinstance(scenarios, ScenarioDataset):
-        return model_card(what, scenarios.folder, len(scenarios), name)
-    card = f"# Traffic model, {what}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"
-    return append_cards(card, [] if name is None else [name])
+    settings = getattr(recipe, find_section(method), None)
+    if settings is None:
+        raise ConfigError(f"recipe {name} has no section {method}: name another recipe, or train by --method rlft.")
+    return settings

@@ -10,7 +10,7 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
 from rlftsim.goals.attainment import Outcome, measure_outcome
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
@@ -22,13 +22,13 @@ def report_outcomes(folder: Path, scenarios: Sequence[Scenario], goals: GoalsFil
     """Print a table of goals and their outcomes, and draw scenarios.
 
     Args:
-        folder: rollouts of `rlftsim simulate`.
-        scenarios: scenarios to report on.
-        goals: goals of their agents; may be empty.
+        folder: Folder of rollouts of `rlftsim simulate`.
+        scenarios: Scenarios to report on.
+        goals: Goals of their agents; may be empty.
         picture: True = draw FOLDER/SCENARIO.png, too.
 
     Raises:
-        DataError: damaged rollouts.
+        DataError: Damaged rollouts.
     """
     outcomes, pictures = [], []
     for scenario in scenarios:
@@ -38,22 +38,22 @@ def report_outcomes(folder: Path, scenarios: Sequence[Scenario], goals: GoalsFil
         ]
         if picture:
             pictures.append(folder / f"{scenario.scenario_id}.png")
-            draw_goals(pictures[-1], [picture_of(states, scenario, entries)], panel_inches=PICTURE_INCHES)
+            draw_goals(pictures[-1], [draw_outcome(states, scenario, entries)], panel_inches=PICTURE_INCHES)
     if outcomes:
         print_wide(outcome_table(outcomes))
     for path in pictures:
-        print(path)
+        print_line(path)
 
 
 def read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:
     """Rollouts of a scenario in a folder that `rlftsim simulate` wrote.
 
     Args:
-        folder: has a file SCENARIO.npz.
-        scenario: the simulated scenario.
+        folder: Folder with a file SCENARIO.npz.
+        scenario: Simulated scenario.
 
     Raises:
-        DataError: a damaged file, or one without the agents of the scenario.
+        DataError: Damaged file, or one without the agents of the scenario.
     """
     # Files of an earlier call may be damaged or of an older data set.
     entry = RolloutEntry(scenario.scenario_id, folder / f"{scenario.scenario_id}.npz", "npz")
@@ -83,18 +83,19 @@ def outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
     return table
 
 
-def picture_of(states: SimulatedStates, scenario: Scenario, entries: Sequence[GoalEntry]) -> GoalPanel:
+def draw_outcome(states: SimulatedStates, scenario: Scenario, entries: Sequence[GoalEntry]) -> GoalPanel:
     """Goals and the simulated paths of their agents; without goals the paths of the evaluated agents.
 
     Args:
-        states: rollouts of the scenario.
-        scenario: map and log.
-        entries: goals of its agents; may be empty.
+        states: Rollouts of the scenario.
+        scenario: Map and log.
+        entries: Goals of its agents; may be empty.
     """
     targeted = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
     # Without goals the picture shows the agents that the metric evaluates.
     free = [(agent, None, "") for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist()]
     marks = tuple(
-        DrawnGoal(*one, driven=states.simulated_path(one[0]).numpy().astype(np.float64)) for one in targeted or free
+        DrawnGoal(agent_id, position, label, driven=states.simulated_path(agent_id).numpy().astype(np.float64))
+        for agent_id, position, label in targeted or free
     )
     return GoalPanel(scenario.scenario_id, scenario, marks)

@@ -8,6 +8,8 @@ import torch
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.policies import registry
 from rlftsim.policies.registry import Device
+from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.scenario.any_form import Name, to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -112,3 +114,34 @@ def to_sampling(sampling: Any) -> Sampling:
     if not isinstance(sampling, Sampling | None):
         raise ConfigError(f"sampling must be rs.Sampling(temperature, top_k) or None, got {sampling!r}.")
     return sampling or Sampling()
+
+
+def to_recipe(recipe: Any) -> Recipe:
+    """The recipe itself, or the recipe of a name.
+
+    Args:
+        recipe: Recipe, or the name of one.
+
+    Raises:
+        ConfigError: No such recipe.
+    """
+    return recipe if isinstance(recipe, Recipe) else recipe_by_name(validate_name(recipe, "recipe", "smart-demo"))
+
+
+def check_config(config: object, section: str, *classes: type) -> None:
+    """Check that settings are of a kind that a verb takes, not a whole recipe.
+
+    Args:
+        config: Settings, or None.
+        section: Section of a recipe, for the message.
+        classes: Classes of settings.
+
+    Raises:
+        ConfigError: Settings of no such kind.
+    """
+    if not isinstance(config, (*classes, type(None))):
+        *most, last = (settings_class.__name__ for settings_class in classes)
+        names = f"{', '.join(most)} or {last}" if most else last
+        raise ConfigError(
+            f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."
+        )

@@ -9,6 +9,7 @@ from torch import nn
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.folder import check_file
+from rlftsim.jobs.progress import print_line
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.registry import load_policy
@@ -39,7 +40,7 @@ def import_model(checkpoint: Path, vocabulary: list[Path], out: Path, *, format:
     weights = sum(p.numel() for p in imported.policy.parameters())
     print(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
     for note in imported.notes:
-        print(f"  {note}")
+        print_line(f"  {note}")
 
 
 def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
@@ -48,7 +49,7 @@ def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
     Importing them again gives the same bits.
 
     Args:
-        model: A SMART model: a run, a model folder or a registered name.
+        model: SMART model: run, model folder or registered name.
         out: File for the weights, .safetensors; the tables go to the same name with .vocabulary.npz.
         format: Code that the keys are for.
     """

@@ -46,10 +46,10 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
     the whole data set.
 
     Args:
-        plan: the work.
-        model: for "evaluate" and "submit", as the command line names it.
-        data: data set; for "convert" the tfrecord files or other sources, of which everything is converted.
-        num_measured: scenarios.
+        plan: Kind of work.
+        model: Model as the command line names it; for "evaluate" and "submit" alone.
+        data: Data set; for "convert" the tfrecord files or other sources, of which everything is converted.
+        num_measured: Number of scenarios to measure.
     """
     if plan == "convert":
         with tempfile.TemporaryDirectory() as folder:
@@ -83,10 +83,10 @@ def forecast_s(seconds: float, num_scenarios: int, num_pieces: int, num_cores: i
     """Time until the last core is done, where each takes one piece of the work after another.
 
     Args:
-        seconds: of one scenario on one core.
-        num_scenarios: in all.
-        num_pieces: of the work; the scenarios are spread evenly over them.
-        num_cores: at work at the same time.
+        seconds: Processor time of one scenario on one core.
+        num_scenarios: Number of scenarios in all.
+        num_pieces: Number of pieces of the work; the scenarios are spread evenly over them.
+        num_cores: Cores at work at the same time.
     """
     rounds = math.ceil(num_pieces / num_cores)
     return seconds * num_scenarios / num_pieces * rounds
@@ -96,12 +96,12 @@ def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: 
     """Time and price on one core, one machine and all machines.
 
     Args:
-        plan: the work.
-        cost: of a scenario.
-        num_scenarios: in all; None = those of the Waymo Open Motion Dataset.
-        nodes: machines.
-        cores: of a machine.
-        price: of a core for an hour, in dollars.
+        plan: Kind of work.
+        cost: Cost of a scenario.
+        num_scenarios: Number of scenarios in all; None = those of the Waymo Open Motion Dataset.
+        nodes: Number of machines.
+        cores: Cores of a machine.
+        price: Price of a core for an hour, in dollars.
     """
     total = num_scenarios or WOMD_SCENARIOS[plan]
     pieces = max(round(WOMD_PIECES[plan] * total / WOMD_SCENARIOS[plan]), 1)

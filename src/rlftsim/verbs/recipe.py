@@ -3,10 +3,10 @@
 import inspect
 from typing import Any
 
-from rlftsim.recipes.registry import RECIPES, recipe_by_name
+from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import recipe_as_json, recipe_as_text
 from rlftsim.verbs.arguments import Name
-from rlftsim.verbs.inputs import validate_name
+from rlftsim.verbs.inputs import to_recipe
 
 
 def recipe(name: Name = "") -> Any:
@@ -27,7 +27,7 @@ def recipe(name: Name = "") -> Any:
     """
     if name == "":
         return {name: _summarize(RECIPES.get(name)) for name in RECIPES.names()}
-    return recipe_by_name(validate_name(name, "recipe", "smart-demo"))
+    return to_recipe(name)
 
 
 def _summarize(make: Any) -> str:

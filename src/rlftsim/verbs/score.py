@@ -11,7 +11,7 @@ from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Unfinished, Work
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism import score as score_scenario
@@ -57,19 +57,19 @@ def score(
     Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
 
     Args:
-        scenarios: The simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic".
+        scenarios: Simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic".
             In Python, for rollouts in memory, scenarios with their logged futures, in the same order.
-        rollouts: A file of rollouts, or a folder of them; in Python also a result of `simulate`.
+        rollouts: File of rollouts, or folder of them; in Python also a result of `simulate`.
         metric: Year of the meta-metric. 2024 is the configuration of that year read by today's code, 2024_original_code
             the code of that year too.
         out: Folder for the per-scenario results (Parquet).
         name: Name of the table row and of the file. Left out: the name of the rollouts.
         explain: Folder for one page per scenario that attributes the lost score to features, agents and steps.
-        missing_map: A scenario without road edges stops the run, as in the official evaluator, or is left out and
-            listed.
-        missing_scenario: Rollouts of a scenario that is not among the given ones stop the run, or are left out and
-            listed.
-        limit: Only the first so many scenarios.
+        missing_map: Treatment of a scenario without road edges: it stops the run, as in the official evaluator, or is
+            left out and listed.
+        missing_scenario: Treatment of rollouts of a scenario that is not among the given ones: they stop the run, or
+            are left out and listed.
+        limit: Number of scenarios, the first ones; left out, all of them.
         jobs: Processes, each with one thread; left out, as many as there are cores. Changes no result.
         work: Machines that share the work on files.
 
@@ -177,4 +177,4 @@ def print_scores(result: Evaluation, *, json: bool = False) -> None:
         print_wide(format_scores(result))
     # On standard error, so that --json prints nothing but JSON.
     for skipped in result.skipped:
-        print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)
+        print_line(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)

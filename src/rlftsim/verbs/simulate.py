@@ -16,7 +16,7 @@ from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
 from rlftsim.goals.maneuvers.reach import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.progress import log, print_line, progress_bar
 from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -78,7 +78,7 @@ def simulate(
     is simulated again. In Python, without a folder, the rollouts are returned.
 
     Args:
-        policy: A run, a model folder, or a registered name such as "constant_velocity". In Python also a policy, which
+        policy: Run, model folder, or registered name such as "constant_velocity". In Python also a policy, which
             is simulated as in evaluation mode.
         scenarios: Folder of a data set, or "synthetic" for the scenarios that ship with the package. In Python also an
             opened data set, and, for rollouts in memory, one scenario, several or a batch. Only history, map and lights
@@ -92,7 +92,7 @@ def simulate(
         out: Folder for the rollouts. Left out in Python, all are in memory at once.
         split: Split of the data set.
         scenario: Ids of the scenarios to simulate; left out, all of them.
-        limit: Only the first so many scenarios.
+        limit: Number of scenarios, the first ones of the data set; left out, all of them.
         goal: AGENT=X,Y is the goal of an agent of the one --scenario, in meters in the world frame of the log. May be
             given many times.
         guidance_scale: Factor on the goal-progress bias of the model's logits: above 1 it follows goals more closely
@@ -269,7 +269,7 @@ def _simulate_files(
     for exported in map(scenarios.by_id, ids if exporters else ()):
         states = read_rollouts(out, exported)
         for write in exporters:
-            print(write(exported, states, out))
+            print_line(write(exported, states, out))
     return paths
 
 

@@ -34,8 +34,8 @@ def studio(
 
     Args:
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
-        model: A run, a model folder, or a registered name; may be given many times. Left out: "demo-goals".
-        rollouts: A file or folder of rollouts, of any simulator, for a panel of its own; may be given many
+        model: Run, model folder, or registered name; may be given many times. Left out: "demo-goals".
+        rollouts: File or folder of rollouts, of any simulator, for a panel of its own; may be given many
             times.
         split: Split that is shown first. Left out: validation, where there is one.
         out: Folder of everything that the page saves.

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
-from rlftsim.jobs.files import remove_temporaries_below, write_text
+from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, find_differences
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner, check_begun, choose_runner
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
+    INDEX,
     MANIFEST,
     SHARDS,
     Manifest,
@@ -188,7 +189,8 @@ def generate(
             format=WholeFiles(shards, attrgetter("shard_name"), ShardReader, attrgetter("num_scenarios")),
             show_progress=show_progress,
         )  # fmt: skip
-        remove_temporaries_below(folder)  # of processes that were killed
+        # of processes that were killed
+        remove_temporaries([marker, folder / INDEX, folder / MANIFEST, *paths])
 
         # 3. Index and manifest.
         entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]

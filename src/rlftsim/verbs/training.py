@@ -1,0 +1,166 @@
+"""Parts that the verbs `pretrain` and `finetune` share."""
+
+import copy
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from rlftsim.errors import ConfigError, RlftsimError
+from rlftsim.evaluation.calibration_picture import write_calibration_picture
+from rlftsim.evaluation.learning_curve import write_learning_curve
+from rlftsim.jobs.progress import log
+from rlftsim.policies.registry import find_device
+from rlftsim.recipes.card import append_cards, model_card
+from rlftsim.rollout.policy import Policy, get_device
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.open import list_splits, open_dataset
+from rlftsim.scenario.types import Scenarios
+from rlftsim.training.parallel import is_first_process
+from rlftsim.training.run import train_policy
+from rlftsim.verbs.inputs import to_policy
+
+VALIDATION = "validation"
+"""Split that is validated on where none is named."""
+
+
+def load_start(policy: Any) -> tuple[Policy, Any]:
+    """A policy that may be trained in place, its weights on the CPU where it was given by its name; and the device for
+    the result.
+
+    Args:
+        policy: Policy, which is copied, or a name for `load_policy`.
+
+    Raises:
+        ConfigError: Neither a policy nor the name of one.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return to_policy(policy, "cpu"), find_device("auto")
+    # without weights there is nothing to copy; training refuses such a policy with a message
+    given = to_policy(policy)
+    return copy.deepcopy(given) if isinstance(given, nn.Module) else given, get_device(given)
+
+
+def train(
+    policy: Policy,
+    scenarios: Scenarios,
+    out: str | os.PathLike[str] | None,
+    settings: Any,
+    *,
+    held_out: Scenarios | None,
+    card: str,
+    device: Any,
+) -> Any:
+    """The policy, trained in place and ready to simulate; the pictures of its run are drawn.
+
+    Args:
+        policy: Policy to train.
+        scenarios: Training scenarios, with their futures.
+        out: Folder of the run; None = a temporary one.
+        settings: Settings of the method.
+        held_out: Scenarios for validation; None = no validation.
+        card: README of the model folder.
+        device: Device of the result.
+    """
+    # Weights of a loaded policy are frozen; each method freezes again what it does not train.
+    if isinstance(policy, nn.Module):
+        policy.requires_grad_(True)
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
+            train_policy(policy, scenarios, folder, settings, held_out=held_out, card=card)
+    else:
+        with _learning_curve(Path(out)):
+            model = train_policy(policy, scenarios, out, settings, held_out=held_out, card=card)
+        if is_first_process():
+            write_calibration_picture(model)
+    assert isinstance(policy, nn.Module)
+    return policy.eval().requires_grad_(False).to(device)
+
+
+def print_model(policy: Policy, *, out: Path) -> None:
+    """Print where the model is.
+
+    Args:
+        policy: Trained policy.
+        out: Folder of the run.
+    """
+    print(f"model: {out / 'model'}")
+
+
+def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str:
+    """README of the model folder; terms are known of data sets and of starts that have a name.
+
+    Args:
+        description: Words for the kind of training, such as "pre-trained".
+        scenarios: Training scenarios.
+        start: Policy that training started from, or its name; None = fresh weights.
+    """
+    name = start if isinstance(start, str | os.PathLike) else None
+    if start is not None:
+        description = f"{description} from {name or type(start).__name__}"
+    if isinstance(scenarios, ScenarioDataset):
+        return model_card(description, scenarios.folder, len(scenarios), name)
+    card = f"# Traffic model, {description}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"
+    return append_cards(card, [] if name is None else [name])
+
+
+def with_processes(settings: Any, processes: Any) -> Any:
+    """Settings of a run on so many processes; the settings themselves for None.
+
+    Args:
+        settings: Settings of the method.
+        processes: Number of processes, "auto", or None.
+    """
+    return settings if processes is None else replace(settings, device=replace(settings.device, processes=processes))
+
+
+def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset | None:
+    """Scenarios to validate on; None = no validation was requested, or the data set has no such split and none
+    was named.
+
+    Args:
+        data: Training scenarios as they were handed over; only a data set has a split to validate on.
+        split: Split to validate on; None = "validation", where the data set has it.
+        every: Updates between two validations; 0 = none.
+
+    Raises:
+        ConfigError: A split is named, but there is no validation.
+        DataError: No such split.
+    """
+    if split is not None and not every:
+        raise ConfigError(f"--validation-split {split} has no effect: set validation.every to a number of updates.")
+    if not every:
+        return None
+    if isinstance(data, ScenarioDataset) and split is not None:
+        data = data.folder
+    if not isinstance(data, str | os.PathLike):
+        if split is not None:
+            raise ConfigError(f"validation_split={split!r} has no effect: the scenarios are not those of a data set.")
+        return None
+    if split is None and VALIDATION not in list_splits(data):
+        log.info(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
+        return None
+    return open_dataset(data, split or VALIDATION)
+
+
+@contextmanager
+def _learning_curve(out: Path) -> Iterator[None]:
+    """Draw the learning curve of a run when it ends, for whatever reason."""
+    try:
+        yield
+    except BaseException:
+        # The reason why the run ended matters more than a picture that could not be drawn.
+        with suppress(RlftsimError, OSError):
+            _draw(out)
+        raise
+    _draw(out)
+
+
+def _draw(out: Path) -> None:
+    if is_first_process():
+        write_learning_curve(out)
