@@ -480,10 +480,8 @@ def _read_table(path: Path) -> Rows:
     Raises:
         DataError: The table is missing or damaged, or a column is missing, of another type or has empty cells.
     """
-    try:
-        table = read_parquet(path, "write it again")
-    except FileNotFoundError:
-        raise DataError(f"{path.name}: there is no such table beside {TRACKS}") from None
+    missing = f"{path.name}: there is no such table beside {TRACKS}"
+    table = read_parquet(path, "write it again", missing=missing)
     rows = read_rows(path.name, table, _SCHEMAS[path.name])
     if path.name in (MAP, LANES) and "scenario_id" not in rows and "map_id" not in rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")
