@@ -368,7 +368,7 @@ def _read_topology(rows: Rows | None, features: Sequence[tuple[int, int, np.ndar
         for side, name in enumerate(("left", "right")):
             links["neighbors"] += [(lane, side, target, 0, last[lane], 0, last[target]) for target in targets[name]]
         limit = rows["speed_limit_mph"][row] if "speed_limit_mph" in rows else np.nan  # NaN = unknown
-        if np.isinf(limit):
+        if abs(limit) > np.finfo(np.float32).max:
             raise rows.error(row, f"speed_limit_mph is {limit:g}")
         speed_limit[index[lane]] = np.nan_to_num(limit)
         interpolating[index[lane]] = "interpolating" in rows and bool(rows["interpolating"][row])
