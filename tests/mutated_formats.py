@@ -393,6 +393,16 @@ def make_begun_drive(folder: Path) -> None:
         drive(folder)
 
 
+def fail(folder: Path) -> None:
+    words = ("--traffic", "replay", "--particles", "2", "--budget", "20000", "--event", "collision", "--films", "0")
+    run("failures", "constant_velocity", "--data", folder / "set", *words, "--out", folder / "out")
+
+
+def make_failures(folder: Path) -> None:
+    write_set(folder)
+    fail(folder)
+
+
 def measure(folder: Path) -> None:
     data = folder / "set"
     measure_variances(entries.Wanderer(), data, folder / "variances", EVALUATE, show_progress=False)
@@ -590,6 +600,18 @@ FORMATS: Mapping[str, Format] = {
         {"b.parquet": "parquet", "out/*.parquet": "parquet"}, make_drives, read_drives, ("evaluation.drive_results",)
     ),
     "begun drive": Format({"out/*.parts/*.json": "json"}, make_begun_drive, drive, ("evaluation.resumable",)),
+    "failures": Format(
+        {"out/failures.parquet": "parquet"},
+        make_failures,
+        lambda folder: run("failures", "show", folder / "out", "0"),
+        ("envs.failure_study",),
+    ),
+    "begun failures": Format(
+        {"out/failures.json": "json", "out/pilot/*": "json", "out/repeats/*": "json"},
+        make_failures,
+        fail,
+        ("envs.failure_run",),
+    ),
     "measurements": Format({"*/s?.json": "json"}, make_measured, measure, ("evaluation.resumable",)),
     "rollouts": Format({"rollouts/*": "npz"}, make_rollouts, score("rollouts"), ("evaluation.rollout_files",)),
     "messages of rollouts": Format(

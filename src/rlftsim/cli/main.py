@@ -19,7 +19,8 @@ from rlftsim.jobs.threads import keep_freed_memory
 
 VERBS = (
     "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "runs",
-    "augment", "models", "model", "goals", "simulate", "drive", "studio", "score", "evaluate", "compare", "submit",
+    "augment", "models", "model", "goals", "simulate", "drive", "failures", "studio", "score", "evaluate", "compare",
+    "submit",
     "experiment",
 )  # fmt: skip
 """Verbs in the order in which a newcomer needs them."""
@@ -47,6 +48,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   goals        propose goals for agents and write a goals file, or check one
   simulate     roll out scenarios with a model
   drive        let a planner drive among simulated traffic, and score both
+  failures     estimate how often a planner fails in realistic traffic, and show how
   studio       ask agents for things in the browser, and look at what happens
 
   score        score rollouts of any simulator with the official realism meta-metric
@@ -61,7 +63,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "runs", "models", "model", "goals", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
-HAVE_SHARES = ("augment", "convert", "evaluate", "score", "simulate", "submit build", "synthesize")
+HAVE_SHARES = ("augment", "convert", "evaluate", "failures", "score", "simulate", "submit build", "synthesize")
 """Commands with --share, whose shares `join` puts together."""
 SIGNALLED = 128
 """Added to the number of the signal that ended the command: 130 = Ctrl-C, 143 = SIGTERM, 138 = SIGUSR1."""

@@ -18,11 +18,18 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, hash_code, load_planner, read_action_settings
+from rlftsim.envs.planners.registry import (
+    Planner,
+    PlannerFailure,
+    guard_planner,
+    hash_code,
+    load_planner,
+    read_action_settings,
+)
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
-from rlftsim.errors import ConfigError, DataError, RlftsimError, in_short, locate_error, whole_number
+from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED, FAILURES, DriveResult, DriveSettings, rank_scenarios
 from rlftsim.evaluation.resumable import (
     ScenarioValues,
@@ -145,26 +152,11 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
         PlannerFailure: The planner raises an error, calls exit(), or wants what its type of action does not allow.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    try:
+    with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
         planner.reset(info)
         while not env.state.ended[0]:
             observation, *_ = env.step(planner.act(observation))
-    # exit() would end the command as if all were done; a machine without memory is no fault of the planner
-    except (Exception, SystemExit) as error:
-        if isinstance(error, MemoryError):
-            raise
-        cause = f"exit({error.code!r})" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
-        # messages of ours say all that a user needs
-        cause = str(error) if isinstance(error, RlftsimError) else f"{cause} ({locate_error(error)})"
-        raise PlannerFailure(
-            f"planner {type(planner).__name__} fails at step {env.state.world.step} of scenario "
-            f"{scenario.scenario_id}: {cause}"
-        ) from error
     return env.result()
-
-
-class PlannerFailure(DataError):
-    """A planner cannot drive a scenario."""
 
 
 def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult | None:

@@ -341,12 +341,13 @@ def _comfort(record: Record) -> float:
 
 
 @cached_on_scenario
-def _signals(scenario: Scenario) -> Signals | None:
+def find_signals(scenario: Scenario) -> Signals | None:
+    """Traffic lights of a scenario, with the lanes that they are on; None without any."""
     return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
 
 
 def _red_light(record: Record) -> float:
-    signals = _signals(record.scene.scenario)
+    signals = find_signals(record.scene.scenario)
     if signals is None:
         return 0.0
     x, y = torch.from_numpy(record.agent_motion[:, :2] + record.scene.scenario.origin).float().T[:, None, None]

@@ -250,6 +250,8 @@ COMMANDS = {
         "rlftsim.verbs.simulate:simulate", ("policy",), ("out",), {**MODEL, "scenarios": "data"}, "print_rollouts"
     ),
     "drive": Command("rlftsim.verbs.drive:drive", ("planner",)),
+    "failures": Command("rlftsim.verbs.failures:failures", ("planner",)),
+    "failures show": Command("rlftsim.verbs.failures:show_failure", ("folder", "number")),
     "studio": Command("rlftsim.verbs.studio:studio"),
     "score": Command("rlftsim.verbs.score:score", ("rollouts",), show="print_scores"),
     "evaluate": Command("rlftsim.verbs.evaluate:evaluate", ("policy",), ("out",), MODEL, "print_evaluation"),

@@ -9,12 +9,13 @@ import importlib
 import inspect
 import secrets
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, partial
 from typing import Any, Protocol, get_args, runtime_checkable
 
 from rlftsim.envs.actions import MIN_HORIZON, ActionType
-from rlftsim.errors import ConfigError, in_short
+from rlftsim.errors import ConfigError, DataError, RlftsimError, in_short, locate_error
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.shards import hash_file
 
@@ -110,11 +111,9 @@ def load_planner(name: str) -> Planner:
         way = f"with {', '.join(options)}" if options else "without arguments"
         raise ConfigError(f"planner {name!r} cannot be made {way} ({type(error).__name__}: {error}).") from error
     if not isinstance(planner, Planner):
-        if not callable(planner):
-            class_name = type(planner).__name__
-            raise ConfigError(f"planner {name!r} is of type {class_name}: give it reset(info) and act(observation).")
-        _check_argument(f"planner {name!r}", planner, "observation")
-        planner = CallablePlanner(planner)
+        if callable(planner):
+            _check_argument(f"planner {name!r}", planner, "observation")
+        planner = to_planner(planner, f"planner {name!r}")
     _check_argument(f"reset of planner {name!r}", planner.reset, "info")
     _check_argument(f"act of planner {name!r}", planner.act, "observation")
     read_action_settings(planner)  # an unknown action ends here, not in the first episode
@@ -140,6 +139,55 @@ def _split_options(name: str) -> tuple[str, dict[str, Any]]:
             f"planner {in_short(name)} cannot be read: write options by keyword, 'careful:Careful(headway=1.0)'."
         ) from None
     return location, options
+
+
+def to_planner(planner: Any, name: str = "planner") -> Planner:
+    """A planner, of a name, a function from observation to action, or itself.
+
+    Args:
+        planner: Name that `load_planner` takes, function, or object with `reset` and `act`.
+        name: Name of the planner at the beginning of the message.
+
+    Raises:
+        ConfigError: None of these.
+    """
+    if isinstance(planner, str):
+        return load_planner(planner)
+    if isinstance(planner, Planner) and not isinstance(planner, type):
+        return planner
+    if not callable(planner) or isinstance(planner, type):
+        raise ConfigError(f"{name} is of type {type(planner).__name__}: give it reset(info) and act(observation).")
+    return CallablePlanner(planner)
+
+
+class PlannerFailure(DataError):
+    """A planner cannot drive a scenario."""
+
+
+@contextmanager
+def guard_planner(planner: Planner, scenario_id: str, read_step: Callable[[], int]) -> Iterator[None]:
+    """Turn any error of a planner, and exit(), which would end the command as if all were done, into one line.
+
+    Args:
+        planner: Planner that is called within.
+        scenario_id: Scenario for the message.
+        read_step: Function that tells the step of the episode for the message.
+
+    Raises:
+        PlannerFailure: The planner raises an error, calls exit(), or wants what its type of action does not allow.
+    """
+    try:
+        yield
+    except MemoryError:  # no fault of the planner
+        raise
+    except (Exception, SystemExit) as error:
+        cause = f"exit({error.code!r})" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
+        # messages of ours say all that a user needs
+        cause = str(error) if isinstance(error, RlftsimError) else f"{cause} ({locate_error(error)})"
+        name = type(planner.function if isinstance(planner, CallablePlanner) else planner).__name__
+        raise PlannerFailure(
+            f"planner {name} fails at step {read_step()} of scenario {scenario_id}: {cause}"
+        ) from error
 
 
 def _check_argument(name: str, function: Callable[..., Any], argument: str) -> None:
