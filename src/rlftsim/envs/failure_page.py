@@ -30,9 +30,9 @@ BEFORE_STEPS, AFTER_STEPS = 30, 5
 """Steps of a film before and after the event."""
 _CSS = """
 .failure { margin: 2rem 0; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .5rem 1.5rem; }
-.facts dt { color: var(--muted); font-size: .85rem; }
-.facts dd { margin: 0; }
+.failure-facts { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: .5rem 1.5rem; }
+.failure-facts dt { color: var(--muted); font-size: .85rem; }
+.failure-facts dd { margin: 0; }
 .table-scroll { overflow-x: auto; }
 .failures-table td, .failures-table th { padding: .2rem .8rem .2rem 0; text-align: left; white-space: nowrap; }
 """
@@ -225,4 +225,4 @@ def _exhibit_html(exhibit: Exhibit) -> str:
     facts = exhibit.facts().items()
     terms = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in facts)
     figure = animation_html(replace(animation, first_step=first_step))
-    return f'<section class="failure"><dl class="facts">{terms}</dl>{figure}</section>'
+    return f'<section class="failure"><dl class="failure-facts">{terms}</dl>{figure}</section>'

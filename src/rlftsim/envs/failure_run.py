@@ -62,8 +62,8 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         raise DataError(all_pilots[0].problem)
     # 2. the repeats
     counts = share_budget(pilots, config.particles, budget)
-    items = [(pilot.scenario_id, number) for pilot, count in zip(pilots, counts) for number in range(1, count + 1)]
-    names = [f"{scenario_id}-{number}" for scenario_id, number in items]
+    items = [(pilot, number) for pilot, count in zip(pilots, counts) for number in range(1, count + 1)]
+    names = [f"{pilot.scenario_id}-{number}" for pilot, number in items]
     rounds: list[tuple[Repeat, ...]] = _measure(
         f"failures of {config.planner}",
         ScenarioValues(out / "repeats", names, _agree(names, identity), _read_round),
@@ -118,8 +118,10 @@ def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
     return pilot
 
 
-def _drive_round(config: StudyConfig, items: Sequence[tuple[str, int]], position: int) -> dict[str, object]:
-    repeats = config.chain(*items[position]).estimate(config.particles, REPEATS)
+def _drive_round(config: StudyConfig, items: Sequence[tuple[Pilot, int]], position: int) -> dict[str, object]:
+    pilot, number = items[position]
+    episodes = config.chain(pilot.scenario_id, number)
+    repeats = episodes.estimate(config.particles, REPEATS, is_branching=not pilot.is_quiet)
     return {"probability": float(np.mean([r.probability for r in repeats])), "repeats": [asdict(r) for r in repeats]}
 
 

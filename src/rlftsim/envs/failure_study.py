@@ -2,7 +2,7 @@
 
 The pilot drives a few undisturbed episodes of each scenario. What is left of the budget goes where the root of variance
 times cost is largest, by a guess from the pilot; the estimates themselves use none of its episodes, so the guess biases
-nothing. `envs.failure_run` drives both.
+nothing. Where the guess is tiny, repeats have no branches. `envs.failure_run` drives both.
 
 A budget is a number of steps, so that the same command gives the same bytes on any machine; minutes are turned into
 steps at `STEPS_PER_S`.
@@ -45,6 +45,8 @@ REPEATS = 4
 NUMBERS_PER_ROUND = 1 << 24
 """Dice of a round; those of the next round follow."""
 LEAST_PROBABILITY = 1e-9
+QUIET_PROBABILITY = 1e-4
+"""Scenarios with a lower guess are measured by undisturbed episodes: dozens of levels cost more than they tell."""
 _BUDGET = re.compile(r"(\d+(?:\.\d+)?)([smh]?)")
 _SECONDS = {"s": 1, "m": 60, "h": 3600}
 
@@ -161,6 +163,11 @@ class Pilot:
         scale = max(float((upper - upper[0]).mean()), 1e-3)
         return float(np.clip(0.5 * math.exp(max(upper[0] / scale, -700)), LEAST_PROBABILITY, 1 / len(danger)))
 
+    @property
+    def is_quiet(self) -> bool:
+        """True = the event is so unlikely that branches do not pay."""
+        return self.guess() < QUIET_PROBABILITY
+
 
 @dataclass(frozen=True)
 class ScenarioEstimate:
@@ -241,10 +248,10 @@ class Study:
         texts = []
         for unit, size in (("1 000 km", km / 1000), ("hour", hours)):
             rate, low, high = (value / size if size else math.nan for value in values)
+            interval = f" [{format_rate(low)}, {format_rate(high)}]" if math.isfinite(low) else ""
             texts.append(
-                f"fewer than {high:.3g} per {unit}" if rate == 0
-                else f"{rate:.3g} per {unit}" + (f" [{low:.3g}, {high:.3g}]" if math.isfinite(low) else "")
-            )  # fmt: skip
+                f"{format_rate(rate)} per {unit}{interval}" if rate else f"fewer than {format_rate(high)} per {unit}"
+            )
         note = "" if math.isfinite(values[1]) else "; without an interval: too few repeats"
         return f"{self.config.event} of {self.config.planner}: {', '.join(texts)}{note}"
 
@@ -254,6 +261,11 @@ class Study:
         about = json.dumps(asdict(self.config))
         table = pa.Table.from_pylist(rows, schema=SCHEMA).replace_schema_metadata({"rlftsim": about})
         write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+
+
+def format_rate(rate: float) -> str:
+    """A rate with three digits, without an exponent where it is large."""
+    return f"{rate:,.0f}".replace(",", " ") if rate >= 100 else f"{rate:.3g}"
 
 
 SCHEMA = pa.schema({
@@ -302,7 +314,7 @@ def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[i
     """
     guess = np.array([pilot.guess() for pilot in pilots])
     per_episode = np.array([pilot.num_steps / len(pilot.danger) for pilot in pilots])
-    num_levels = np.log(guess) / math.log(1 - KILLED)
+    num_levels = np.where(guess < QUIET_PROBABILITY, 0.0, np.log(guess) / math.log(1 - KILLED))
     cost = REPEATS * particles * per_episode * (1 + KILLED * num_levels)
     deviation = guess * np.sqrt((1 - guess - np.log(guess)) / (REPEATS * particles))
     rest = budget - sum(pilot.num_steps for pilot in pilots)
