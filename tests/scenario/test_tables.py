@@ -147,6 +147,10 @@ BAD = {
     "across": ({"tracks": [{**r, "vx": 0.0, "vy": 9.0} for r in TWO]}, "tracks.parquet: velocities contradict"),
     "time base": ({"scenarios": [{**ROW, "step_s": 0.2}]}, "moves at 5.0 m/s, its velocity is 10.0 m/s and"),
     "headings": ({"tracks": [{**r, "heading": 1.4} for r in TWO]}, "tracks.parquet: headings contradict the motion"),
+    "heights": (
+        {"tracks": [{**r, "z": 40.0} for r in TWO], "map_rows": [{**r, "z": 0.0} for r in MAP]},
+        r"tracks.parquet: heights \(z\) contradict the map near 2 of 2 moving tracks: track . is at 40.0 m",
+    ),
     "predict twice": ({"scenarios": [{**ROW, "predict": [8, 8]}]}, "row 0: predict lists object 8 twice"),
     "lane twice": ({"lanes": [LANE, LANE]}, "lanes.parquet: row 1: a second row with lane_id 1"),
     "light twice": ({"lights": [LIGHT, {**LIGHT, "state": "go"}]}, "row 1: a second row with lane_id 1, step 0"),

@@ -18,8 +18,9 @@ from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 
 VERBS = (
-    "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "augment",
-    "model", "goals", "simulate", "drive", "failures", "studio", "score", "evaluate", "compare", "submit",
+    "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "runs",
+    "augment", "models", "model", "goals", "simulate", "drive", "failures", "studio", "score", "evaluate", "compare",
+    "submit",
     "experiment",
 )  # fmt: skip
 """Verbs in the order in which a newcomer needs them."""
@@ -40,7 +41,9 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   tokens       build a vocabulary of motion and map tokens, or measure its coverage
   pretrain     train a model on logged tracks
   finetune     fine-tune a model in closed loop with a realism reward, also with goals
+  runs         list training runs: how far they are, how good, and which settings differ
   augment      sample further goals for goal-conditioned fine-tuning
+  models       list the models in the box and those of other packages
   model        average models; import a checkpoint of the public CAT-K code, or export one
   goals        propose goals for agents and write a goals file, or check one
   simulate     roll out scenarios with a model
@@ -57,7 +60,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   join VERB .. put the shares of a command together that ran on several machines (--share K/N)
 """
 
-STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "studio", "compare")
+STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "runs", "models", "model", "goals", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
 HAVE_SHARES = ("augment", "convert", "evaluate", "failures", "score", "simulate", "submit build", "synthesize")

@@ -214,7 +214,7 @@ class FailureChain:
             for step in range(0, self.block_steps, episode.controls.steps):
                 if len(acts):
                     seen = look(episode, state)
-                    with guard_planner(self.planner, self.scenario_id):
+                    with guard_planner(self.planner, self.scenario_id, lambda now=begin + step: now):
                         for row in acts[acts < count]:
                             action[row] = planners[row].act(seen.of_agent(int(row)))
                 forced = imposed[:, step : step + episode.controls.steps]

@@ -23,8 +23,8 @@ from rlftsim.jobs.documents import describe_type, parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
+from rlftsim.realism.config import LIGHT
 from rlftsim.realism.miss import compute_miss_rates
-from rlftsim.realism.official_names import LIGHT
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.sources import guessed_note
 from rlftsim.scenario.types import Scenario

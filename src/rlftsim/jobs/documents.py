@@ -9,7 +9,9 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable
-from os import PathLike, fstat
+from errno import ESPIPE
+from os import PathLike, fspath, fstat, stat
+from stat import S_ISFIFO, S_ISSOCK
 from typing import Any
 
 from rlftsim.errors import DataError, RlftsimError, printable
@@ -148,8 +150,20 @@ def first_line(problem: BaseException) -> str:
     return printable(line)
 
 
+def check_has_end(path: str | PathLike[str]) -> None:
+    """Check that a path is no pipe, whose reader may wait for ever; those that a shell makes, `<(...)`, have an end.
+
+    Raises:
+        OSError: No file, or a named pipe or socket.
+    """
+    mode = stat(path).st_mode
+    if (S_ISFIFO(mode) or S_ISSOCK(mode)) and not fspath(path).startswith("/dev/"):
+        raise OSError(ESPIPE, "a pipe, not a file")
+
+
 def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError]) -> bytes:
     try:
+        check_has_end(path)
         with open(path, "rb") as file:
             # a device or a pipe has no size, so the bytes that come are counted, too
             text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None

@@ -9,11 +9,12 @@ needed.
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
-from functools import cached_property
-from typing import Any, Protocol, get_args, runtime_checkable
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64, Shaped
@@ -297,10 +298,9 @@ class Scenario:
             DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
         features = self.map_features
-        _check_shapes(self.tracks, "tracks")
-        _check_shapes(features, "map")
-        _check_shapes(features.topology, "topology")
-        _check_shapes(self.lights, "lights")
+        tables = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
+        for name, table in tables.items():
+            _check_shapes(table, name)
 
     def check_consistency(self) -> None:
         """Check what every reader relies on: steps of 0.1 s, track indices, ids that differ, types, states, sizes, map.
@@ -535,3 +535,28 @@ def list_scenario_ids(scenarios: Scenarios) -> Iterable[str]:
     # a data set has the ids in the index: no scenario is read
     scenario_ids = getattr(scenarios, "scenario_ids", None)
     return scenario_ids if scenario_ids is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))
+
+
+Value = TypeVar("Value")
+Arguments = ParamSpec("Arguments")
+
+
+def cached_on_scenario(
+    compute: Callable[Concatenate[Scenario, Arguments], Value],
+) -> Callable[Concatenate[Scenario, Arguments], Value]:
+    """Decorator that caches a function of a scenario, and of further hashable arguments, with the scenario.
+
+    The values are dropped together with the scenario.
+    """
+    # weak keys: the cache must not keep a scenario in memory that its data set has dropped
+    cache: WeakKeyDictionary[Scenario, dict[Hashable, Value]] = WeakKeyDictionary()
+
+    @wraps(compute)
+    def remembered(scenario: Scenario, *arguments: Arguments.args, **named: Arguments.kwargs) -> Value:
+        values = cache.setdefault(scenario, {})
+        key = (arguments, tuple(named.items()))
+        if key not in values:
+            values[key] = compute(scenario, *arguments, **named)
+        return values[key]
+
+    return remembered

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64
 
 from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.index_row import AGENT_COLUMNS, IndexRow, compute_index_row
+from rlftsim.scenario.shards import AGENT_COLUMNS, compute_index_row
 from rlftsim.scenario.types import TOTAL_STEPS, Scenarios
 
 MAP_POINTS_PER_AGENT = 200
@@ -33,12 +33,12 @@ def count_columns(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndar
 
     Args:
         scenarios: a data set, or scenarios of other types, which are counted here.
-        columns: fields of `IndexRow` that are numbers.
+        columns: Names in `INDEX_FIELDS` of columns with numbers.
     """
     if isinstance(scenarios, ScenarioDataset):
         return np.array([scenarios.index[name].to_pylist() for name in columns], dtype=np.int64)
-    rows: list[IndexRow] = [compute_index_row(scenarios[i], "") for i in range(len(scenarios))]
-    return np.array([[getattr(row, name) for row in rows] for name in columns], dtype=np.int64)
+    rows = [compute_index_row(scenarios[i], "") for i in range(len(scenarios))]
+    return np.array([[row[name] for row in rows] for name in columns], dtype=np.int64)
 
 
 def check_scored(scenarios: Scenarios) -> None:

@@ -6,7 +6,7 @@ name and renamed when whole, so a folder of that name is never half-written.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,13 +82,16 @@ def parse_update(path: Path) -> int:
     return int(path.name.removeprefix(PREFIX))
 
 
-def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> Progress:
+def read_checkpoint(
+    path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, names: Collection[str] = ()
+) -> Progress:
     """Load weights and moments in place.
 
     Args:
         path: Folder of the checkpoint, named after the update.
         modules: Modules by the names that `write_checkpoint` got; weights are loaded in place.
         optimizer: Optimizer with the same parameters in the same order; the learning rate stays.
+        names: Names of the numbers that the progress must have.
 
     Returns:
         The position of the run.
@@ -102,7 +105,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         # everything is checked before anything is loaded
         weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
         moments = _read(path / "optimizer.safetensors", way_out)
-        _check_progress(values, parse_update(path))
+        _check_progress(values, parse_update(path), names)
         for name, module in modules.items():
             _check_weights(name, weights[name], module)
         state = _parse_moments(moments, optimizer)
@@ -124,7 +127,7 @@ def _read(path: Path, way_out: str) -> dict[str, Tensor]:
         raise CheckpointError(f"{path} is missing: {way_out}.") from None
 
 
-def _check_progress(values: Mapping[str, Any], update: int) -> None:
+def _check_progress(values: Mapping[str, Any], update: int, names: Collection[str]) -> None:
     """Check the position of a run against the name of the folder.
 
     Raises:
@@ -135,6 +138,8 @@ def _check_progress(values: Mapping[str, Any], update: int) -> None:
     numbers = values.get("numbers")
     if not isinstance(numbers, dict) or not all(type(v) in (int, float) and math.isfinite(v) for v in numbers.values()):
         raise ValueError("its numbers are not finite numbers by name")
+    if missing := [name for name in names if name not in numbers]:
+        raise ValueError(f"its progress lacks the number {missing[0]}")
 
 
 def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) -> None:

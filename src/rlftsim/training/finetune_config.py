@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 from rlftsim.errors import ConfigError, check_finiteness, check_not_negative, check_positive, check_types
@@ -13,6 +14,7 @@ from rlftsim.training.freezing import TrainedModules
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.reference import KlConfig
+from rlftsim.training.validation import ValidationConfig
 
 Reduction = Literal["mean", "sum"]
 
@@ -70,6 +72,7 @@ class FinetuneConfig:
     """After so many skipped updates the run stops with its last good checkpoint."""
     goals: GoalConfig = field(default_factory=GoalConfig)
     alarms: AlarmConfig = field(default_factory=AlarmConfig)
+    validation: ValidationConfig = field(default_factory=partial(ValidationConfig, keep_best=True))
     checkpoint_every: int = 50
     """Updates."""
     seed: int = 0

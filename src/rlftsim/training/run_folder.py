@@ -4,6 +4,7 @@ config.json        the settings, every default filled in
 environment.json   versions, machine, command, commit
 metrics.jsonl      a line per update; also as TensorBoard events in tensorboard/
 checkpoints/       see `training.checkpoint`
+best/              weights behind the best validations, where the best is kept
 model/             the trained policy, once the run is done (`save_pretrained`)
 """
 
@@ -189,6 +190,10 @@ class RunFolder:
     def has_model(self) -> bool:
         """True once a run has ended here."""
         return (self.model / "config.json").exists()
+
+    def best(self, update: int) -> Path:
+        """File of the weights that were best in validation, behind an update."""
+        return self.path / "best" / f"update-{update:08d}.safetensors"
 
     def finish(self) -> None:
         """Store the settings of a run that was made longer; until then the stored settings belong to the earlier model.

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import nn
 
 from rlftsim.errors import ConfigError, check_not_negative, check_positive, check_types, given
@@ -51,6 +52,9 @@ class ValidationConfig:
     """Configuration of the meta-metric."""
     seed: int = 0
     """Of the choice and of the rollouts, the same at every validation."""
+    keep_best: bool = False
+    """The model of the run is that of the best validation: of the highest lower bound (95 %, one-sided) of its gain in
+    RMM over the start, scenario by scenario. False = the model of the last update."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -95,22 +99,62 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
         check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
 
 
+class Validator:
+    """Validations of a run, each on the same scenarios with the same dice.
+
+    Args:
+        scenarios: Held-out scenarios to select from, with futures.
+        config: Number and choice of scenarios and rollouts.
+        fabric: Processes of the run, which divide the scenarios.
+        start: Policy at the start of the run, to which gains refer; None = no gains are logged.
+
+    Raises:
+        DataError: A scenario withholds its future.
+    """
+
+    def __init__(self, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric, start: nn.Module | None = None):
+        self._scenarios, self.config, self._fabric = scenarios, config, fabric
+        clusters = getattr(scenarios, "clusters", np.arange(len(scenarios)))  # lists of scenarios name none
+        self._clusters = np.array(clusters)[config.choose(len(scenarios))]
+        self._start = None if start is None else validate(start, scenarios, config, fabric)[1]
+
+    def validate(self, model: nn.Module) -> dict[str, float]:
+        """Metrics of a model, see `validate`; with the gain in RMM over the start, and the lower bound of the gain.
+
+        Args:
+            model: Policy in training; left unchanged.
+        """
+        from rlftsim.statistics import cluster_bootstrap, mean_interval  # as in `validate`
+
+        values, rmm = validate(model, self._scenarios, self.config, self._fabric)
+        if self._start is not None:
+            gains = rmm - self._start
+            gain = mean_interval(gains, alpha=0.1)
+            if 1 < len(set(self._clusters)) < len(gains):
+                gain = cluster_bootstrap(gains, self._clusters, level=0.9)
+            values |= {"validation_gain": gain.mean, "validation_gain_low": gain.interval[0]}
+        return values
+
+
 @torch.no_grad()
-def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric) -> dict[str, float]:
+def validate(
+    model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric
+) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
     """Mean realism of a model's rollouts, and the use of the map; each process takes a part of the scenarios.
 
     Args:
-        model: a policy; left unchanged, training mode included.
+        model: Policy; left unchanged, training mode included.
         scenarios: Held-out scenarios to select from, with futures.
-        config: number and choice of scenarios and rollouts.
+        config: Number and choice of scenarios and rollouts.
         fabric: Processes of the run, over which sums are added.
 
     Returns:
-        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
-        predicts tokens the loss and map use on vehicles (`training.map_use`), and the seconds taken.
+        1. Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
+           predicts tokens the loss and map use on vehicles (`training.map_use`), and the seconds taken.
+        2. Meta-metric of each selected scenario; NaN where undefined.
 
     Raises:
-        DataError: a scenario withholds the future.
+        DataError: A scenario withholds the future.
     """
     from rlftsim.statistics import interval_around  # scipy.stats: half a second that configurations need not pay
 
@@ -118,7 +162,10 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     # A copy, so that neither the mode nor a cache of the model in training changes.
     frozen: Any = copy.deepcopy(model).eval().requires_grad_(False)
     # Dealt out in turn: the same scenarios in total for any number of processes.
-    selected = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
+    choice = config.choose(len(scenarios))
+    selected = choice[fabric.global_rank :: fabric.world_size]
+    rmm = torch.zeros(len(choice), dtype=torch.float64, device=fabric.device)
+    positions = torch.arange(len(choice), device=fabric.device)[fabric.global_rank :: fabric.world_size]
     sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
     map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
     for first in range(0, len(selected), config.scenarios_per_pass):
@@ -132,6 +179,7 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
         states = states_of_rollouts(batch, rollouts)
         realism = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
         values = torch.stack([getattr(realism, name).double() for name in WATCHED.values()], -1)  # [B, metrics]
+        rmm[positions[first : first + config.scenarios_per_pass]] = values[:, 0]
         # A scenario may have no finite value of a metric: it is left out of that mean.
         finite = values.isfinite()
         values = torch.where(finite, values, 0.0)
@@ -144,4 +192,5 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     logged = dict(zip(WATCHED, mean.tolist())) | {"validation_rmm_low": low, "validation_rmm_high": high}
     if map_use is not None:
         logged |= MapUse(all_reduce_sum(map_use.sums, fabric)).to_metrics("validation_")
-    return {**logged, "seconds_validation": time.perf_counter() - start}
+    rmm = all_reduce_sum(rmm, fabric).cpu().numpy()
+    return {**logged, "seconds_validation": time.perf_counter() - start}, rmm

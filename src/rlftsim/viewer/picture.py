@@ -36,11 +36,7 @@ COLORS = {
 }
 ROLES = ("other", "evaluated", "ego")
 MIN_PEDESTRIAN_RADIUS_M = 0.5
-LIGHT_COLORS = {
-    **dict.fromkeys("147", "#c4161c"),
-    **dict.fromkeys("258", "#d9a514"),
-    **dict.fromkeys("36", "#11754b"),
-}
+LIGHT_COLORS = {**dict.fromkeys("147", "#c4161c"), **dict.fromkeys("258", "#d9a514"), **dict.fromkeys("36", "#11754b")}
 """Colors of stop, caution and go, by WOMD's numbers of a light's states."""
 MARK_STYLES = {"collides": "-", "offroad": "--"}
 """Line styles of the frames around agents, by the field of `SceneMotion` that marks them."""
