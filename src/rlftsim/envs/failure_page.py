@@ -170,10 +170,8 @@ HEADINGS = ("scenario", "P", "95 %", "repeats", "Monte Carlo needs", "contact", 
 
 
 def study_rows(study: Study) -> list[tuple[str, ...]]:
-    """Cells of the table: a row per scenario, the most probable event first, then those that were left out."""
-    rows = [_cells(estimate) for estimate in sorted(study.scenarios, key=lambda estimate: -estimate.probability)]
-    blank = ("",) * (len(HEADINGS) - 2)
-    return rows + [(scenario_id, "happened at the start", *blank) for scenario_id in study.problems]
+    """Cells of the table: a row per scenario, the most probable event first."""
+    return [_cells(estimate) for estimate in sorted(study.scenarios, key=lambda estimate: -estimate.probability)]
 
 
 def _cells(estimate: ScenarioEstimate) -> tuple[str, ...]:
@@ -215,7 +213,8 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
     )
     body = f'<h1>{escape(title)}</h1><p class="lead">{escape(intro)}</p>' + "\n".join(map(_exhibit_html, exhibits))
     table = f'<div class="table-scroll"><table class="failures-table"><tr>{cells}</tr>{rows}</table></div>'
-    write_text(path, page_html(title, f"{body}<h2>Scenarios</h2>{table}", extra_css=_CSS))
+    problems = "".join(f"<p>Left out: {escape(problem)}</p>" for problem in study.problems.values())
+    write_text(path, page_html(title, f"{body}<h2>Scenarios</h2>{table}{problems}", extra_css=_CSS))
 
 
 def _exhibit_html(exhibit: Exhibit) -> str:

@@ -17,7 +17,7 @@ from rlftsim.envs.failures import Failure, Repeat
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.resumable import ScenarioValues
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import group_positions, group_task, run_items
 from rlftsim.jobs.processes import Advance, Task
@@ -78,7 +78,7 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
     study = Study(config, tuple(estimates), problems)
     study.write(out / FAILURES)
-    remove_temporaries_below(out)
+    remove_temporaries([out / ABOUT, out / FAILURES])  # of processes that were killed
     return study
 
 
@@ -94,6 +94,7 @@ def _measure(
     groups = group_positions(len(format.scenario_ids), 1)
     with Lease(format.folder / ".lock", runner, "works in") as lease:
         values = run_items(title, groups, group_task(work, format), format=format, lease=lease, runner=runner)
+        remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
         lease.remove()
     return values
 
@@ -102,9 +103,9 @@ def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict
     episodes = config.chain(ids[position])
     try:
         episodes.check_start()
-    except DataError as error:
+        paths, danger = episodes.start(np.arange(config.pilot))
+    except DataError as error:  # also a planner that fails
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
-    paths, danger = episodes.start(np.arange(config.pilot))
     driven_m = float(np.mean([path.driven_m for path in paths]))
     return asdict(
         Pilot(ids[position], tuple(danger.max(1).tolist()), driven_m, sum(len(path.motion) for path in paths))

@@ -34,7 +34,7 @@ from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.documents import first_line, parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet, read_parquet_metadata
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.types import STEP_S
 
 STEPS_PER_S = 600
