@@ -368,7 +368,7 @@ def test_idm_traffic_stops_before_it_goes_the_other_way(speed, acceleration):
 
 def test_traffic_of_smart_that_backs_up_starts_without_a_jump(model):
     log = build_scenario("backing", (Mover(x_m=60.0, y_m=30.0), Mover(x_m=10.0, speed_mps=-5.0)))
-    world = build_world([log], model, rules={"ego": "planner"})
+    world = build_world([log], model, rules={"ego": "planner", "*": "policy"})
     state = begin(world, [Dice(0)])
     moved = step_world(world, state, world.logged[0, :1, CURRENT_STEP]).motion[0, 1, :2] - state.motion[0, 1, :2]
     assert np.linalg.norm(moved) < 1.0

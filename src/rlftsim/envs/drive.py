@@ -18,7 +18,14 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, guard_planner, hash_code, load_planner, read_action_settings
+from rlftsim.envs.planners.registry import (
+    Planner,
+    PlannerFailure,
+    guard_planner,
+    hash_code,
+    load_planner,
+    read_action_settings,
+)
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism

@@ -20,7 +20,7 @@ from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import group_positions, group_task, run_items
-from rlftsim.jobs.processes import Advance, Task
+from rlftsim.jobs.processes import Task
 from rlftsim.jobs.runner import Joining, Runner, Share
 
 ABOUT = "failures.json"
@@ -183,9 +183,7 @@ class _Telling:
     folder: Path
     _probability: dict[str, float] = field(default_factory=dict)
 
-    def run(
-        self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
-    ) -> list[Any]:
+    def run(self, task: Task, items: Sequence[Any], *, advance: Any, describe: Callable[[Any], str] = str) -> list[Any]:
         """Results of all items, see `Runner`."""
 
         def tell(count: int = 1, note: str = "") -> None:

@@ -179,7 +179,7 @@ class FailureChain:
         size = 1 << (count - 1).bit_length()
         rows = np.resize(np.arange(count), size)  # those beyond `count` are run and not kept
         shared = np.zeros(size, np.int64) if blocks is None else blocks[rows]
-        given = [None] * size if parents is None else [parents[row] for row in rows]
+        given = [None] * size if parents is None else [parents[int(row)] for row in rows]
         episode, dice = self._episode(size), dice[rows]
         state = start(episode, self._dice(dice[:, 0]))
         danger = np.full((size, 1 + self.num_blocks * self.block_steps), np.nan)

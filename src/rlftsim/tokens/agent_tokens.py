@@ -20,7 +20,8 @@ HISTORY_TOKENS = 2
 """Token steps up to the current step."""
 MAX_HEADING_STEP_RAD = 1.5
 MAX_START_ERROR_M = 0.3
-"""Mean distance of the corners from the log up to which a simulation begins where the history tokens end."""
+"""Mean distance of the corners from the log up to which a simulation begins where the history tokens end. Of 11 595
+agents of WOMD 99 % are below 0.17 m in the public vocabulary; all synthetic ones are below 0.18 m in the demo's."""
 _ROWS_PER_CHUNK = 512
 _ROWS_PER_CHUNK_ELSEWHERE = 1 << 12
 _CANDIDATES = 64
