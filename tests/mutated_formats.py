@@ -394,7 +394,7 @@ def make_begun_drive(folder: Path) -> None:
 
 
 def fail(folder: Path) -> None:
-    words = ("--traffic", "replay", "--particles", "2", "--budget", "20000", "--event", "collision", "--films", "0")
+    words = ("--traffic", "replay", "--particles", "2", "--budget", "4000", "--event", "collision", "--films", "0")
     run("failures", "constant_velocity", "--data", folder / "set", *words, "--out", folder / "out")
 
 

@@ -40,10 +40,13 @@ def test_a_budget_is_a_duration_of_a_core_or_a_number_of_steps():
 
 
 def test_the_budget_goes_where_failures_are_likely_and_every_scenario_has_a_round():
-    pilots = [pilot([-9.0, -8.5, -8.2, -8.0]), pilot([-3.0, -1.0, -0.5, 0.0]), pilot([-np.inf] * 4)]
-    repeats = share_budget(pilots, 16, 200_000)
-    assert min(repeats) >= 1
-    assert repeats[1] == max(repeats) > 5 * repeats[0]
+    pilots = [pilot([-9.0, -8.0, -5.0, -4.0]), pilot([-3.0, -1.0, -0.5, 0.0]), pilot([-np.inf] * 4)]
+    plan = share_budget(pilots, 16, 200_000)
+    counts = [count for count, _ in plan]
+    assert min(counts) >= 1
+    assert counts[1] == max(counts) > 5 * counts[0]
+    assert [branches for _, branches in plan] == [True, True, False]
+    assert [branches for _, branches in share_budget(pilots, 16, 30_000)] == [False, True, False]
     with pytest.raises(ConfigError, match=r"too small for 4 repeats in each of 3 scenarios: give --budget .*m or more"):
         share_budget(pilots, 16, 5000)
 

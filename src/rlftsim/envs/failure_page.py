@@ -30,9 +30,9 @@ BEFORE_STEPS, AFTER_STEPS = 30, 5
 """Steps of a film before and after the event."""
 _CSS = """
 .failure { margin: 2rem 0; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .5rem 1.5rem; }
-.facts dt { color: var(--muted); font-size: .85rem; }
-.facts dd { margin: 0; }
+.failure-facts { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: .5rem 1.5rem; }
+.failure-facts dt { color: var(--muted); font-size: .85rem; }
+.failure-facts dd { margin: 0; }
 .table-scroll { overflow-x: auto; }
 .failures-table td, .failures-table th { padding: .2rem .8rem .2rem 0; text-align: left; white-space: nowrap; }
 """
@@ -170,10 +170,8 @@ HEADINGS = ("scenario", "P", "95 %", "repeats", "Monte Carlo needs", "contact", 
 
 
 def study_rows(study: Study) -> list[tuple[str, ...]]:
-    """Cells of the table: a row per scenario, the most probable event first, then those that were left out."""
-    rows = [_cells(estimate) for estimate in sorted(study.scenarios, key=lambda estimate: -estimate.probability)]
-    blank = ("",) * (len(HEADINGS) - 2)
-    return rows + [(scenario_id, "happened at the start", *blank) for scenario_id in study.problems]
+    """Cells of the table: a row per scenario, the most probable event first."""
+    return [_cells(estimate) for estimate in sorted(study.scenarios, key=lambda estimate: -estimate.probability)]
 
 
 def _cells(estimate: ScenarioEstimate) -> tuple[str, ...]:
@@ -215,7 +213,8 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
     )
     body = f'<h1>{escape(title)}</h1><p class="lead">{escape(intro)}</p>' + "\n".join(map(_exhibit_html, exhibits))
     table = f'<div class="table-scroll"><table class="failures-table"><tr>{cells}</tr>{rows}</table></div>'
-    write_text(path, page_html(title, f"{body}<h2>Scenarios</h2>{table}", extra_css=_CSS))
+    problems = "".join(f"<p>Left out: {escape(problem)}</p>" for problem in study.problems.values())
+    write_text(path, page_html(title, f"{body}<h2>Scenarios</h2>{table}{problems}", extra_css=_CSS))
 
 
 def _exhibit_html(exhibit: Exhibit) -> str:
@@ -225,4 +224,4 @@ def _exhibit_html(exhibit: Exhibit) -> str:
     facts = exhibit.facts().items()
     terms = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in facts)
     figure = animation_html(replace(animation, first_step=first_step))
-    return f'<section class="failure"><dl class="facts">{terms}</dl>{figure}</section>'
+    return f'<section class="failure"><dl class="failure-facts">{terms}</dl>{figure}</section>'

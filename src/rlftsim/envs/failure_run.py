@@ -28,6 +28,20 @@ ABOUT = "failures.json"
 Value = TypeVar("Value")
 
 
+@dataclass(frozen=True)
+class _Round:
+    """Repeats of a scenario that run side by side."""
+
+    scenario_id: str
+    number: int
+    is_branching: bool
+
+    @property
+    def name(self) -> str:
+        """Stem of the file."""
+        return f"{self.scenario_id}-{'' if self.is_branching else 'quiet'}{self.number}"
+
+
 def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int], Runner]) -> Study:
     """Estimates of all scenarios, and `failures.parquet`; only what earlier calls left undone is done.
 
@@ -61,24 +75,30 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     if not pilots:
         raise DataError(all_pilots[0].problem)
     # 2. the repeats
-    counts = share_budget(pilots, config.particles, budget)
-    items = [(pilot.scenario_id, number) for pilot, count in zip(pilots, counts) for number in range(1, count + 1)]
-    names = [f"{scenario_id}-{number}" for scenario_id, number in items]
+    plan = share_budget(pilots, config.particles, budget)
+    items = [
+        _Round(pilot.scenario_id, number, is_branching)
+        for pilot, (count, is_branching) in zip(pilots, plan) for number in range(1, count + 1)
+    ]  # fmt: skip
+    names = [item.name for item in items]
     rounds: list[tuple[Repeat, ...]] = _measure(
         f"failures of {config.planner}",
         ScenarioValues(out / "repeats", names, _agree(names, identity), _read_round),
         partial(_drive_round, config, items),
         _show_estimate(runner(len(items)), out / "repeats"),
     )
-    ends = np.cumsum(counts)
     estimates = [
-        ScenarioEstimate(pilot, config.particles, tuple(chain.from_iterable(rounds[end - count : end])))
-        for pilot, count, end in zip(pilots, counts, ends)
+        ScenarioEstimate(
+            pilot,
+            config.particles,
+            tuple(chain.from_iterable(r for item, r in zip(items, rounds) if item.scenario_id == pilot.scenario_id)),
+        )
+        for pilot in pilots
     ]
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
     study = Study(config, tuple(estimates), problems)
     study.write(out / FAILURES)
-    remove_temporaries([out / FAILURES, out / ABOUT, *out.glob("*/*.json")])  # of processes that were killed
+    remove_temporaries([out / ABOUT, out / FAILURES])  # of processes that were killed
     return study
 
 
@@ -94,6 +114,7 @@ def _measure(
     groups = group_positions(len(format.scenario_ids), 1)
     with Lease(format.folder / ".lock", runner, "works in") as lease:
         values = run_items(title, groups, group_task(work, format), format=format, lease=lease, runner=runner)
+        remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
         lease.remove()
     return values
 
@@ -102,9 +123,9 @@ def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict
     episodes = config.chain(ids[position])
     try:
         episodes.check_start()
-    except DataError as error:
+        paths, danger = episodes.start(np.arange(config.pilot))
+    except DataError as error:  # also a planner that fails
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
-    paths, danger = episodes.start(np.arange(config.pilot))
     driven_m = float(np.mean([path.driven_m for path in paths]))
     return asdict(
         Pilot(ids[position], tuple(danger.max(1).tolist()), driven_m, sum(len(path.motion) for path in paths))
@@ -118,8 +139,10 @@ def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
     return pilot
 
 
-def _drive_round(config: StudyConfig, items: Sequence[tuple[str, int]], position: int) -> dict[str, object]:
-    repeats = config.chain(*items[position]).estimate(config.particles, REPEATS)
+def _drive_round(config: StudyConfig, items: Sequence[_Round], position: int) -> dict[str, object]:
+    item = items[position]
+    episodes = config.chain(item.scenario_id, item.number)
+    repeats = episodes.estimate(config.particles, REPEATS, is_branching=item.is_branching)
     return {"probability": float(np.mean([r.probability for r in repeats])), "repeats": [asdict(r) for r in repeats]}
 
 

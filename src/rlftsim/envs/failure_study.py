@@ -2,7 +2,7 @@
 
 The pilot drives a few undisturbed episodes of each scenario. What is left of the budget goes where the root of variance
 times cost is largest, by a guess from the pilot; the estimates themselves use none of its episodes, so the guess biases
-nothing. `envs.failure_run` drives both.
+nothing. Where the guess is tiny, repeats may have no branches. `envs.failure_run` drives both.
 
 A budget is a number of steps, so that the same command gives the same bytes on any machine; minutes are turned into
 steps at `STEPS_PER_S`.
@@ -45,6 +45,9 @@ REPEATS = 4
 NUMBERS_PER_ROUND = 1 << 24
 """Dice of a round; those of the next round follow."""
 LEAST_PROBABILITY = 1e-9
+QUIET_PROBABILITIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1.0)
+"""Scenarios whose guess is below the least of these that the budget allows are measured by undisturbed episodes: for
+them, dozens of levels would cost more than they tell."""
 _BUDGET = re.compile(r"(\d+(?:\.\d+)?)([smh]?)")
 _SECONDS = {"s": 1, "m": 60, "h": 3600}
 
@@ -241,10 +244,10 @@ class Study:
         texts = []
         for unit, size in (("1 000 km", km / 1000), ("hour", hours)):
             rate, low, high = (value / size if size else math.nan for value in values)
+            interval = f" [{format_rate(low)}, {format_rate(high)}]" if math.isfinite(low) else ""
             texts.append(
-                f"fewer than {high:.3g} per {unit}" if rate == 0
-                else f"{rate:.3g} per {unit}" + (f" [{low:.3g}, {high:.3g}]" if math.isfinite(low) else "")
-            )  # fmt: skip
+                f"{format_rate(rate)} per {unit}{interval}" if rate else f"fewer than {format_rate(high)} per {unit}"
+            )
         note = "" if math.isfinite(values[1]) else "; without an interval: too few repeats"
         return f"{self.config.event} of {self.config.planner}: {', '.join(texts)}{note}"
 
@@ -254,6 +257,11 @@ class Study:
         about = json.dumps(asdict(self.config))
         table = pa.Table.from_pylist(rows, schema=SCHEMA).replace_schema_metadata({"rlftsim": about})
         write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+
+
+def format_rate(rate: float) -> str:
+    """A rate with three digits, without an exponent where it is large."""
+    return f"{rate:,.0f}".replace(",", " ") if rate >= 100 else f"{rate:.3g}"
 
 
 SCHEMA = pa.schema({
@@ -289,8 +297,9 @@ def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
         raise DataError(f"{path} is no table of failures ({first_line(error)}): {way_out}.") from None
 
 
-def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[int]:
-    """Rounds of repeats of each scenario: one for each, the others where they narrow the total most.
+def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[tuple[int, bool]]:
+    """Rounds of repeats of each scenario, one for each and the others where they narrow the total most, and True for
+    rounds with branches.
 
     Args:
         pilots: Pilot of each scenario.
@@ -301,16 +310,21 @@ def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[i
         ConfigError: Too few steps for one round of each scenario.
     """
     guess = np.array([pilot.guess() for pilot in pilots])
-    per_episode = np.array([pilot.num_steps / len(pilot.danger) for pilot in pilots])
-    num_levels = np.log(guess) / math.log(1 - KILLED)
-    cost = REPEATS * particles * per_episode * (1 + KILLED * num_levels)
-    deviation = guess * np.sqrt((1 - guess - np.log(guess)) / (REPEATS * particles))
+    undisturbed = REPEATS * particles * np.array([pilot.num_steps / len(pilot.danger) for pilot in pilots])
     rest = budget - sum(pilot.num_steps for pilot in pilots)
-    if rest < cost.sum():
-        needed = math.ceil((budget - rest + cost.sum()) / STEPS_PER_S / 6) / 10
+    if rest < undisturbed.sum():
+        needed = math.ceil((budget - rest + undisturbed.sum()) / STEPS_PER_S / 6) / 10
         raise ConfigError(
             f"a budget of {budget} steps is too small for {REPEATS} repeats in each of {len(pilots)} scenarios: give "
             f"--budget {needed:g}m or more, or choose fewer with --limit."
         )
-    share = deviation * np.sqrt(cost)
-    return [int(number) for number in 1 + np.floor((rest - cost.sum()) * share / share.sum() / cost)]
+    num_levels = np.log(guess) / math.log(1 - KILLED)
+    for quiet in QUIET_PROBABILITIES:
+        is_branching = guess >= quiet
+        cost = undisturbed * (1 + KILLED * np.where(is_branching, num_levels, 0.0))
+        if cost.sum() <= rest:
+            break
+    deviation = guess * np.sqrt((1 - guess - np.log(guess)) / (REPEATS * particles))
+    share = deviation * np.sqrt(cost) + 1e-300
+    counts = 1 + np.floor((rest - cost.sum()) * share / share.sum() / cost)
+    return [(int(count), bool(branches)) for count, branches in zip(counts, is_branching)]

@@ -231,14 +231,16 @@ class FailureChain:
         ]
         return paths, episode, state
 
-    def estimate(self, particles: int, repeats: int) -> tuple[Repeat, ...]:
+    def estimate(self, particles: int, repeats: int, *, is_branching: bool = True) -> tuple[Repeat, ...]:
         """Independent estimates by splitting, side by side, and the episodes in which the event happens.
 
         Args:
             particles: Number of undisturbed episodes at the beginning of each repeat.
             repeats: Number of estimates.
+            is_branching: False = plain Monte Carlo with the undisturbed episodes alone.
         """
-        splits = split(self, particles=particles, repeats=repeats, seed=(self.seed, self.first_number))
+        seed = (self.seed, self.first_number)
+        splits = split(self, particles=particles, repeats=repeats, seed=seed, is_branching=is_branching)
         return tuple(
             Repeat(
                 probability=float(splits.probability[row]),

@@ -64,7 +64,9 @@ class Splits:
     """Largest danger of each final path."""
 
 
-def split(chain: Chain, *, particles: int, repeats: int = 1, seed: int | Sequence[int] = 0) -> Splits:
+def split(
+    chain: Chain, *, particles: int, repeats: int = 1, seed: int | Sequence[int] = 0, is_branching: bool = True
+) -> Splits:
     """Estimates of the probability that the danger of a path reaches 0.
 
     Args:
@@ -72,13 +74,14 @@ def split(chain: Chain, *, particles: int, repeats: int = 1, seed: int | Sequenc
         particles: Number N of paths in each repeat.
         repeats: Number R of independent estimates, which run side by side.
         seed: Seed of the choice of parents.
+        is_branching: False = plain Monte Carlo with the undisturbed paths alone.
     """
     random, num_killed = np.random.default_rng(seed), max(1, round(KILLED * particles))
     next_number = repeats * particles
     paths, danger = chain.start(np.arange(next_number))
     running = np.maximum.accumulate(danger, axis=1)  # [R N, T + 1]
     num_runs = np.full(repeats, particles)
-    num_levels, survival, is_active = np.zeros(repeats, np.int64), np.ones(repeats), np.ones(repeats, bool)
+    num_levels, survival, is_active = np.zeros(repeats, np.int64), np.ones(repeats), np.full(repeats, is_branching)
     while True:
         # 1. the level of each repeat, and all particles that are not above it
         top = running[:, -1].reshape(repeats, particles)

@@ -71,6 +71,8 @@ def failures(
     log.info(f"a budget of {steps} steps, {steps / STEPS_PER_S / 60:.3g} minutes of a core at {STEPS_PER_S} a second")
     study = run_study(config, out, steps, lambda count: work.runner(jobs, work.on_error) or choose_runner(jobs, count))
     print_wide(format_study(study))
+    for problem in study.problems.values():
+        print(f"left out: {problem}")
     print(study.describe_total())
     page = out / "index.html"
     write_failure_page(study, page, limit=films)
