@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -334,13 +334,12 @@ def copy_planner(planner: Planner) -> Planner:
 
 
 @dataclass(frozen=True, eq=False)
-class FailureEstimate:
-    """Probability that an event happens to a planner in a scenario within 8 seconds."""
+class RepeatedEstimate:
+    """Probability of an event in a scenario, by independent repeats."""
 
-    scenario_id: str
     repeats: tuple[Repeat, ...]
     particles: int
-    chain: FailureChain
+    """Undisturbed episodes that each repeat began with."""
 
     @property
     def estimates(self) -> Float[np.ndarray, "R"]:
@@ -352,21 +351,36 @@ class FailureEstimate:
         """Mean of the estimates."""
         return float(self.estimates.mean())
 
-    @cached_property
+    @property
+    def variance(self) -> float:
+        """Of the mean; NaN for a single repeat with an event."""
+        if not self.probability:
+            return 0.0
+        return float(self.estimates.var(ddof=1)) / len(self.repeats) if len(self.repeats) > 1 else math.nan
+
+    @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval; NaN for a single repeat with an event."""
+        """95 % interval, see `splitting.estimate_interval`; NaN for a single repeat with an event."""
         return estimate_interval(self.estimates, self.particles * len(self.repeats))
+
+    @property
+    def num_monte_carlo(self) -> float:
+        """Undisturbed episodes that would give the same standard error; NaN where there is none."""
+        return self.probability * (1 - self.probability) / self.variance if self.variance else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class FailureEstimate(RepeatedEstimate):
+    """Probability that an event happens to a planner in a scenario within 8 seconds."""
+
+    scenario_id: str
+    chain: FailureChain
 
     @property
     def failures(self) -> tuple[Failure, ...]:
         """Episodes in which the event happens; those that stand for most come first."""
         failures = (failure for repeat in self.repeats for failure in repeat.failures)
         return tuple(sorted(failures, key=lambda failure: -failure.probability))
-
-    @property
-    def num_monte_carlo(self) -> float:
-        """Undisturbed episodes that would give as narrow an interval; NaN without one."""
-        return count_monte_carlo(self.probability, self.estimates)
 
     def run_again(self, failure: Failure) -> Result:
         """The episode of a failure, bit for bit, see `FailureChain.run_again`."""
@@ -402,17 +416,6 @@ class FailureEstimate:
             f"P = {self.probability:.2g} [{low:.2g}, {high:.2g}] within 8 s, {len(self.failures)} failing episodes; as "
             f"good as {self.num_monte_carlo:.0f} episodes of Monte Carlo"
         )
-
-
-def count_monte_carlo(probability: float, estimates: Float[np.ndarray, "R"]) -> float:
-    """Undisturbed episodes that would give the same standard error of a probability; NaN where there is none.
-
-    Args:
-        probability: Probability of the event.
-        estimates: Independent estimates whose mean has the standard error.
-    """
-    variance = float(estimates.var(ddof=1)) / len(estimates) if len(estimates) > 1 else 0.0
-    return probability * (1 - probability) / variance if variance else math.nan
 
 
 def choose_failures(failures: Sequence[Failure], limit: int) -> list[Failure]:
@@ -478,4 +481,4 @@ def estimate_failures(
     source = make_source(driver, scenario, policy, **settings)
     chain = FailureChain(source, driver, scenario.scenario_id, found_event, seed=seed)
     chain.check_start()
-    return FailureEstimate(scenario.scenario_id, chain.estimate(particles, repeats), particles, chain)
+    return FailureEstimate(chain.estimate(particles, repeats), particles, scenario.scenario_id, chain)
