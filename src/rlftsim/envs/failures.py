@@ -118,7 +118,7 @@ class FailureChain:
         first_number: Number of the first dice; those of other chains of the same seed should be far away.
 
     Raises:
-        ConfigError: A planner that cannot be copied.
+        ConfigError: A planner that cannot be copied, or an episode shorter than a block.
     """
 
     def __init__(
@@ -129,6 +129,8 @@ class FailureChain:
         per_decision = source.policy.steps_per_decision if source.policy is not None else 1
         self.block_steps = math.lcm(BLOCK_STEPS, per_decision, source.controls.steps)
         self.num_blocks = source.config.max_steps // self.block_steps
+        if not self.num_blocks:
+            raise ConfigError(f"max_steps is {source.config.max_steps}: give at least {self.block_steps}, a block.")
 
     def start(self, numbers: Int64[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
         """Undisturbed episodes, see `Chain`."""
