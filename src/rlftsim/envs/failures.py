@@ -181,13 +181,15 @@ class FailureChain:
         size = 1 << (count - 1).bit_length()
         rows = np.resize(np.arange(count), size)  # those beyond `count` are run and not kept
         shared = np.zeros(size, np.int64) if blocks is None else blocks[rows]
-        given = [None] * size if parents is None else [parents[int(row)] for row in rows]
+        parent_paths = [None] * size if parents is None else [parents[int(row)] for row in rows]
         episode, dice = self._episode(size), dice[rows]
         state = start(episode, self._dice(dice[:, 0]))
         danger = np.full((size, 1 + self.num_blocks * self.block_steps), np.nan)
         planners = [self.planner] * size
-        copies: list[list[Planner]] = [list(path.planners[: k + 1]) if path else [] for path, k in zip(given, shared)]
-        for row, (path, k) in enumerate(zip(given, shared)):
+        copies: list[list[Planner]] = [
+            list(path.planners[: k + 1]) if path else [] for path, k in zip(parent_paths, shared)
+        ]
+        for row, (path, k) in enumerate(zip(parent_paths, shared)):
             if path is None:
                 danger[row, 0] = self.event.danger(StepView(episode, state, row))
             else:
@@ -210,7 +212,7 @@ class FailureChain:
                 copies[row].append(copy_planner(planners[row]))
             imposed = np.full((size, self.block_steps, 5), np.nan)
             for row in np.flatnonzero(shared > block):
-                imposed[row] = given[row].motion[steps]  # type: ignore[union-attr]
+                imposed[row] = parent_paths[row].motion[steps]  # type: ignore[union-attr]
             # 2. the steps
             action = np.zeros((size, *self.source.controls.limits.shape))
             for step in range(0, self.block_steps, episode.controls.steps):
@@ -478,9 +480,9 @@ def estimate_failures(
     """
     for name, number, least in (("particles", particles, 2), ("repeats", repeats, 1), ("seed", seed, 0)):
         whole_number(name, number, least)
-    found_event = find_event(event)
     driver = to_planner(planner)
+    measured_event = find_event(event)
     source = make_source(driver, scenario, policy, **settings)
-    chain = FailureChain(source, driver, scenario.scenario_id, found_event, seed=seed)
+    chain = FailureChain(source, driver, scenario.scenario_id, measured_event, seed=seed)
     chain.check_start()
     return FailureEstimate(chain.estimate(particles, repeats), particles, scenario.scenario_id, chain)
