@@ -25,3 +25,8 @@ def test_lines_and_messages_show_no_control_character(capsys):
     printed = capsys.readouterr()
     assert printed.out == "skipped a 31m b  : no lane\n"
     assert printed.err == "skipped a 31m b  : no lane\na 31m b \n is left out\nin two lines\n"
+
+
+def test_a_long_name_is_printed_without_its_middle(capsys):
+    print_line("a" * 100_000)
+    assert "characters and more" in capsys.readouterr().out

@@ -133,6 +133,7 @@ BAD = {
     "map id": ({"scenarios": [{**ROW, "map_id": "n"}], "map_rows": NAMED_MAP}, "row 0: map n has no rows in map.parq"),
     "no map id": ({"map_rows": NAMED_MAP}, "scenarios.parquet has no column map_id"),
     "speed limit": ({"lanes": [{**LANE, "speed_limit_mph": np.inf}]}, "lanes.parquet: row 0: speed_limit_mph is inf"),
+    "speed limit beyond float32": ({"lanes": [{**LANE, "speed_limit_mph": 1e300}]}, "speed_limit_mph is 1e\\+300"),
     "stop point": ({"lights": [{**LIGHT, "x": np.nan, "y": 0.0}]}, "lights.parquet: row 0: x is nan"),
     "predict": ({"scenarios": [{**ROW, "predict": [5]}]}, "predict lists object 5"),
     "rate": ({"scenarios": [{**ROW, "step_s": 2.0}]}, "step_s is 2, it must lie between"),

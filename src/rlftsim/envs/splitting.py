@@ -10,7 +10,7 @@ R repeats of N particles, T blocks. The danger of a path is at least 0 exactly w
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64, Shaped
@@ -24,6 +24,7 @@ NEGLIGIBLE = 1e-15
 """A repeat whose particles stand for less ends without the event."""
 
 
+@runtime_checkable
 class Chain(Protocol):
     """A Markov chain of T blocks, many paths at a time. Paths are an array, along the first axis."""
 

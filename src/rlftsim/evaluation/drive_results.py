@@ -128,10 +128,8 @@ class DriveResult:
             DataError: Not such a file, or a file that was cut or edited.
         """
         way_out = "not a result of `rlftsim drive`, drive again"
-        try:
-            table = read_parquet(path, way_out)
-        except FileNotFoundError:
-            raise DataError(f"{path}: no such result of `rlftsim drive`: drive again.") from None
+        missing = f"{path}: no such result of `rlftsim drive`: drive again."
+        table = read_parquet(path, way_out, missing=missing)
         metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
         about = parse_json(metadata, way_out, source=str(path))
         try:

@@ -266,10 +266,8 @@ class Evaluation:
             files = sorted(file.name for file in Path(path).glob("*.parquet") if file.is_file())
             hint = f"name one of {', '.join(files)}" if files else "name a Parquet file of `rlftsim evaluate`"
             raise DataError(f"{path} is a folder: {hint}.")
-        try:
-            table = read_parquet(path, "evaluate again")
-        except FileNotFoundError:
-            raise DataError(f"{path}: no such evaluation: make one with `rlftsim evaluate`.") from None
+        missing = f"{path}: no such evaluation: make one with `rlftsim evaluate`."
+        table = read_parquet(path, "evaluate again", missing=missing)
         # our part of the file's metadata; pandas and others may add theirs
         metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
         about = parse_json(metadata, "evaluate again", source=str(path))

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from rlftsim.errors import printable
+from rlftsim.errors import printable, shorten
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200
@@ -63,13 +63,13 @@ def _printable_lines(text: str) -> str:
 
 
 def print_line(text: object, file: Any = None) -> None:
-    """Print a line without control characters, such as those of an id or a file name that a user's file holds.
+    """Print a line without control characters, and without the middle of a long one: users' files hold any name.
 
     Args:
         text: Line, or an object that is shown by its text; a line break in it becomes a space.
         file: Stream of text; None = standard output.
     """
-    print(printable(str(text)), file=file)
+    print(shorten(str(text)), file=file)
 
 
 def print_wide(*tables: object) -> None:

@@ -28,16 +28,19 @@ _ARROW_BEGINNING = b"ARROW1\0\0"
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, pa.ArrowException)
 
 
-def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError) -> pa.Table:
+def read_parquet(
+    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
+) -> pa.Table:
     """Validated table of a Parquet file.
 
     Args:
         path: Parquet file; a folder is none.
         remedy: Way out at the end of every message, such as "convert again".
         error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
-        FileNotFoundError: No such file; the caller names the file in the message.
+        FileNotFoundError: No such file, and no message for that.
         RlftsimError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can
             explain.
     """
@@ -50,6 +53,8 @@ def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimE
             # whose stacks would count as memory
             return _validate_table(pa.Table.from_batches(file.iter_batches(use_threads=False), file.schema_arrow))
     except FileNotFoundError:
+        if missing:
+            raise error(missing) from None
         raise
     except _DAMAGE as problem:
         raise error(f"{path}: cannot be read ({_describe_cause(problem)}): {remedy}.") from None

@@ -222,10 +222,8 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
 
 def _read_rows(file: Path) -> Rows:
     """Rows of a Parquet file of the published schema."""
-    try:
-        table = read_parquet(file, "get the file again")
-    except FileNotFoundError:
-        raise DataError(f"{file.name} is missing: get the file again") from None
+    remedy = "get the file again"
+    table = read_parquet(file, remedy, missing=f"{file.name} is missing: {remedy}")
     try:
         for name in table.schema.names:
             if not any(name in columns for columns in _SCHEMA) and not name.startswith("__index_level_"):
@@ -332,10 +330,8 @@ def _find_map(file: Path) -> Path:
 def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
     """Sizes by kind from a JSON file."""
     example = '{"vehicle": [4.6, 2.0, 1.6]}'
-    try:
-        sizes = read_json(path, f"sizes are written like {example}", error=ConfigError)
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file: sizes are written like {example}.") from None
+    remedy = f"sizes are written like {example}"
+    sizes = read_json(path, remedy, error=ConfigError, missing=f"{path}: no such file: {remedy}.")
     for object_type, size in sizes.items():
         if object_type not in SIZES_M:
             raise ConfigError(f"{path}: no kind {object_type!r}: known are {', '.join(SIZES_M)}.")

@@ -531,10 +531,7 @@ def load_index(folder: Path) -> pa.Table:
     Raises:
         DataError: The file is missing or damaged.
     """
-    try:
-        index = read_parquet(folder / INDEX, "convert again")
-    except FileNotFoundError:
-        raise DataError(f"{folder / INDEX} is missing: convert again") from None
+    index = read_parquet(folder / INDEX, "convert again", missing=f"{folder / INDEX} is missing: convert again")
     try:
         check_columns(index, INDEX_SCHEMA)
     except DataError as error:

@@ -368,7 +368,7 @@ def _read_topology(rows: Rows | None, features: Sequence[tuple[int, int, np.ndar
         for side, name in enumerate(("left", "right")):
             links["neighbors"] += [(lane, side, target, 0, last[lane], 0, last[target]) for target in targets[name]]
         limit = rows["speed_limit_mph"][row] if "speed_limit_mph" in rows else np.nan  # NaN = unknown
-        if np.isinf(limit):
+        if abs(limit) > np.finfo(np.float32).max:
             raise rows.error(row, f"speed_limit_mph is {limit:g}")
         speed_limit[index[lane]] = np.nan_to_num(limit)
         interpolating[index[lane]] = "interpolating" in rows and bool(rows["interpolating"][row])
@@ -480,10 +480,8 @@ def _read_table(path: Path) -> Rows:
     Raises:
         DataError: The table is missing or damaged, or a column is missing, of another type or has empty cells.
     """
-    try:
-        table = read_parquet(path, "write it again")
-    except FileNotFoundError:
-        raise DataError(f"{path.name}: there is no such table beside {TRACKS}") from None
+    missing = f"{path.name}: there is no such table beside {TRACKS}"
+    table = read_parquet(path, "write it again", missing=missing)
     rows = read_rows(path.name, table, _SCHEMAS[path.name])
     if path.name in (MAP, LANES) and "scenario_id" not in rows and "map_id" not in rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")

@@ -9,7 +9,7 @@ import os
 from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
-from typing import Self
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -37,6 +37,8 @@ from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 
 VOCABULARY = "vocabulary.safetensors"
+
+Model = TypeVar("Model", bound="SmartModel")
 
 
 class SmartModel(nn.Module):
@@ -87,7 +89,7 @@ class SmartModel(nn.Module):
             return False
         return are_frozen_alike(self.network.scene_weights(), model.network.scene_weights())
 
-    def with_settings(self, config: SmartConfig, vocabulary: Vocabulary | None, keep: Collection[str]) -> Self:
+    def with_settings(self: Model, config: SmartConfig, vocabulary: Vocabulary | None, keep: Collection[str]) -> Model:
         """Model with other settings and the weights of this one, to be trained further.
 
         Args:
@@ -116,7 +118,7 @@ class SmartModel(nn.Module):
         """True if goals have an effect."""
         return self.config.goal is not None
 
-    def with_goal_conditioning(self, encoding: GoalEncoding, *, logit_bias: bool | None = None) -> Self:
+    def with_goal_conditioning(self: Model, encoding: GoalEncoding, *, logit_bias: bool | None = None) -> Model:
         """Copy with goal-conditioning weights that have no effect yet; the model unchanged if conditioned in this way.
 
         Args:
@@ -140,7 +142,7 @@ class SmartModel(nn.Module):
         load_strictly(policy.network, {**self.network.state_dict(), **fresh}, source="the model to start from")
         return policy.train(self.training)
 
-    def with_guidance(self, scale: float) -> Self:
+    def with_guidance(self: Model, scale: float) -> Model:
         """Copy with a scaled goal logit bias: above 1 goals are followed more closely than was learned; at 1 the model.
 
         Raises:
@@ -175,7 +177,7 @@ class SmartModel(nn.Module):
         save_model(folder, self, asdict(self.config), card=card, weights=self.network.state_dict())
 
     @classmethod
-    def from_pretrained(cls, folder: str | os.PathLike) -> Self:
+    def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
         """Model of a model folder as written by `save_pretrained`, or of a run's folder, in training mode.
 
         Raises:

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -38,6 +38,8 @@ from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import FUTURE_STEPS, HISTORY_STEPS
+
+Model = TypeVar("Model", bound="TrafficBotsPolicy")
 
 
 class TrafficBotsPolicy(nn.Module):
@@ -360,7 +362,7 @@ class TrafficBotsPolicy(nn.Module):
         save_model(folder, self, asdict(self.config), card=card, weights=self.network.state_dict())
 
     @classmethod
-    def from_pretrained(cls, folder: str | os.PathLike) -> Self:
+    def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
         """Model of a model folder as `save_pretrained` writes, or of a run's folder, in training mode.
 
         Args:

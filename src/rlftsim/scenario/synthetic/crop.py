@@ -31,13 +31,8 @@ class Ground:
         return height
 
 
-def draw_ground(rng: np.random.Generator, base_m: float = 24.0) -> Ground:
-    """Ground that rises and falls by 1-2 m over 150 m and stays within about 5 m of `base_m` in the whole network.
-
-    Args:
-        rng: Generator of the slope and the waves.
-        base_m: Height at (0, 0) without waves, m.
-    """
+def draw_ground(rng: np.random.Generator) -> Ground:
+    """Ground that rises and falls by 1-2 m over 150 m and stays within about 5 m of 24 m in the whole network."""
     waves = []
     for _ in range(2):
         # a wave of this length, running in this direction
@@ -46,7 +41,7 @@ def draw_ground(rng: np.random.Generator, base_m: float = 24.0) -> Ground:
         amplitude, wave_x, wave_y = rng.uniform(0.3, 0.8), number * np.cos(angle), number * np.sin(angle)
         waves.append((float(amplitude), float(wave_x), float(wave_y), float(rng.uniform(0, _TWO_PI))))
     angle, steepness = rng.uniform(0, _TWO_PI), rng.uniform(0, 0.006)
-    return Ground(base_m, (float(steepness * np.cos(angle)), float(steepness * np.sin(angle))), tuple(waves))
+    return Ground(24.0, (float(steepness * np.cos(angle)), float(steepness * np.sin(angle))), tuple(waves))
 
 
 MAP_GRID_PER_M = 256
