@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from rlftsim.goals.attainment import compute_tolerance, is_passed, is_reached, is_within, rate
-from rlftsim.goals.logged import logged_endpoints, logged_goals
+from rlftsim.goals.types import logged_endpoints, logged_goals
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
 from rlftsim.rollout.simulate import simulate

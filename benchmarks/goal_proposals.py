@@ -15,9 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.experiments.goal_proposals import road_test
-from rlftsim.goals.maneuvers.logged import logged_maneuver
-from rlftsim.goals.maneuvers.proposals import CurrentAgent, Proposal, no_proposal_reason, propose_from_lanes
-from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S
+from rlftsim.goals.maneuvers.lane_paths import BRISK, HORIZON_S
+from rlftsim.goals.maneuvers.proposals import (
+    CurrentAgent,
+    Proposal,
+    logged_maneuver,
+    no_proposal_reason,
+    propose_from_lanes,
+)
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.types import ObjectType, Scenario
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.policies.registry import load_policy
-from rlftsim.policies.trafficbots.destinations import VEHICLE
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
+from rlftsim.policies.trafficbots.scene import VEHICLE
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset

@@ -188,7 +188,7 @@ def main() -> None:
         draws = draw_training(scene, policy.config, 0.3, hide=True)
 
         def train() -> None:
-            compute_scene_loss(policy.network, policy.config, scene, labels, scene.agent_mask, draws).loss.backward()
+            compute_scene_loss(policy.network, scene, labels, scene.agent_mask, draws).loss.backward()
 
         before = peak_gib()
         least(ours, "training step", train)

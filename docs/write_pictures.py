@@ -161,7 +161,7 @@ AHEAD, RIGHT = (-191.2, -238.1), (-133.5, -185.9)
 ASK = " --goal 191={},{} --guidance-scale 3 --export page"
 FUTURES = simulate("demo-tuned", SEVEN, "futures", " --picture")
 TURN = simulate("demo-goals", BRANCH, "turn", " --goal 99=102.6,76.9 --guidance-scale 3 --picture")
-DRIVE = f"rlftsim drive pdm --model demo-tuned --data synthetic --scenario {SEVEN} --out drive --film"
+DRIVE = f"rlftsim drive pdm --model demo-tuned --data synthetic --scenario {SEVEN} --out drive --film first"
 EXPLAIN = (simulate("demo-tuned", WALKERS, "scored", ""), "rlftsim score scored --scenarios synthetic --explain pages")
 
 PIECES = (

@@ -32,11 +32,9 @@ from rlftsim.evaluation.reward_variance import measure_variances
 from rlftsim.experiments.ledger import Ledger
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_file
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
-from rlftsim.policies.calibrated.table import CHANGES
+from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
 from rlftsim.policies.checkpoint import read_card
-from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk
-from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.config import smart_nano
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.recipes.settings import recipe_as_json
@@ -395,6 +393,16 @@ def make_begun_drive(folder: Path) -> None:
         drive(folder)
 
 
+def fail(folder: Path) -> None:
+    words = ("--traffic", "replay", "--particles", "2", "--budget", "4000", "--event", "collision", "--films", "0")
+    run("failures", "constant_velocity", "--data", folder / "set", *words, "--out", folder / "out")
+
+
+def make_failures(folder: Path) -> None:
+    write_set(folder)
+    fail(folder)
+
+
 def measure(folder: Path) -> None:
     data = folder / "set"
     measure_variances(entries.Wanderer(), data, folder / "variances", EVALUATE, show_progress=False)
@@ -540,7 +548,7 @@ FORMATS: Mapping[str, Format] = {
         {"model/*.json": "json", "model/model.safetensors": "safetensors"},
         make_calibrated,
         read_calibrated,
-        ("policies.checkpoint", "policies.calibrated.table"),
+        ("policies.checkpoint", "policies.calibrated.policy"),
     ),
     "TrafficBots": Format(
         {"model/config.json": "json", "model/*.safetensors": "safetensors"},
@@ -552,13 +560,13 @@ FORMATS: Mapping[str, Format] = {
         {"epoch.ckpt": "checkpoint"},
         make_catk,
         import_catk("epoch.ckpt"),
-        ("policies.smart.lightning_file", "policies.smart.catk_checkpoint"),
+        ("policies.smart.catk_checkpoint",),
     ),
     "CAT-K weights": Format(
         {"weights.safetensors": "safetensors", "tables.npz": "npz"},
         make_catk,
         import_catk("weights.safetensors"),
-        ("policies.smart.catk_checkpoint", "policies.smart.catk_vocabulary"),
+        ("policies.smart.catk_checkpoint",),
     ),
     "run": Format(
         {"run/config.json": "json", "run/metrics.jsonl": "jsonl"}, make_run, read_run, ("training.run_folder",)
@@ -592,6 +600,18 @@ FORMATS: Mapping[str, Format] = {
         {"b.parquet": "parquet", "out/*.parquet": "parquet"}, make_drives, read_drives, ("evaluation.drive_results",)
     ),
     "begun drive": Format({"out/*.parts/*.json": "json"}, make_begun_drive, drive, ("evaluation.resumable",)),
+    "failures": Format(
+        {"out/failures.parquet": "parquet"},
+        make_failures,
+        lambda folder: run("failures", "show", folder / "out", "0"),
+        ("envs.failure_study",),
+    ),
+    "begun failures": Format(
+        {"out/failures.json": "json", "out/pilot/*": "json", "out/repeats/*": "json"},
+        make_failures,
+        fail,
+        ("envs.failure_run",),
+    ),
     "measurements": Format({"*/s?.json": "json"}, make_measured, measure, ("evaluation.resumable",)),
     "rollouts": Format({"rollouts/*": "npz"}, make_rollouts, score("rollouts"), ("evaluation.rollout_files",)),
     "messages of rollouts": Format(

@@ -19,12 +19,11 @@ import third_party
 from av2_files import write_av2
 from made_up import CPU, TINY
 from rlftsim.policies.registry import POLICIES
-from rlftsim.policies.smart.catk_checkpoint import export_catk
-from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk_vocabulary
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.tfrecord import write_records
 from rlftsim.tokens.clustering import build_vocabulary

@@ -34,7 +34,7 @@ NO_FORMAT = {
     "jobs.folder": "for modules that know the format, and the text of a lock, damaged or not",
     "jobs.tables": "for modules that know the format",
     "policies.shipped.__init__": "weights in the box",
-    "scenario.synthetic.recording": "what SUMO has just written",
+    "scenario.synthetic.bodies": "what SUMO has just written",
     "evaluation.explain_page": "whether a page that it moves has an end",
     "experiments.paper.published": "the paper's tables in the box",
     "jobs.buckets": "copies bytes that it does not look at",

@@ -97,9 +97,8 @@ def train(stage, policy, scenarios, out, held_out=None, **changes):
     if stage in ("catk", "road"):
         config = CATK if stage == "catk" else ROAD
         return train_policy(policy, scenarios, out, replace(config, **changes), held_out=held_out)
-    return train_policy(
-        policy, scenarios, out, replace(OF_EVERYTHING if stage == "everything" else FINETUNE, **changes)
-    )
+    config = OF_EVERYTHING if stage == "everything" else FINETUNE
+    return train_policy(policy, scenarios, out, replace(config, **changes), held_out=held_out)
 
 
 def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=None):

@@ -8,9 +8,9 @@ import scenes
 import tiny
 from rlftsim.goals.types import Goals
 from rlftsim.realism import METRIC_2025, compute_batch_features
-from rlftsim.realism.agent_scores import AgentScores
-from rlftsim.realism.batch import score_batch_features
+from rlftsim.realism.credit import AgentScores
 from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.realism.meta_metric import score_batch_features
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 

@@ -23,8 +23,9 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.scenario.dataset import SYNTHETIC
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
-from rlftsim.scenario.open import SYNTHETIC, open_dataset
+from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics

@@ -15,14 +15,14 @@ from full_disk import limit_files_to
 from rlftsim.cli import main
 from rlftsim.envs import EgoEnv
 from rlftsim.envs import drive as drive_module
-from rlftsim.envs.drive import DriveConfig, drive, run_planner
+from rlftsim.envs.drive import DriveConfig, choose_films, drive, run_planner
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, compute_idm_acceleration
 from rlftsim.envs.planner_scores import off_road
 from rlftsim.envs.planners.registry import PLANNERS, hash_code, load_planner, read_action_settings
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import resumable
-from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
+from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison, rank_scenarios
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.shards import hash_file
@@ -188,7 +188,7 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
 def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys):
     out = tmp_path / "drive"
     words = ["drive", "constant_velocity", "--data", "synthetic", "--out", str(out), "--limit", "2"]
-    assert main([*words, "--traffic", "replay, constant_velocity", "--film"]) == 0
+    assert main([*words, "--traffic", "replay, constant_velocity", "--film", "first"]) == 0
     first, second = out / "constant_velocity-replay.parquet", out / "constant_velocity-constant_velocity.parquet"
     table = pq.read_table(first)
     assert table.num_rows == 2
@@ -243,7 +243,7 @@ class Fails:
         with LOG.open("a") as file:
             file.write(info["scenario"] + "\\n")
         if LOG.with_name("fail").exists() and len(LOG.read_text().split()) == 4:
-            raise RuntimeError("no more")
+            raise KeyboardInterrupt("no more")
     def act(self, observation):
         return np.zeros(2, np.float32)
 """
@@ -266,7 +266,7 @@ def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path
 
     # 1. the second scenario of the second kind of traffic fails
     (tmp_path / "fail").touch()
-    with pytest.raises(RuntimeError, match="no more"):
+    with pytest.raises(KeyboardInterrupt, match="no more"):
         driven_by(config)
     (tmp_path / "fail").unlink()
     assert driven_by(config) == list(ids[1:])
@@ -296,7 +296,7 @@ def test_a_quick_look_keeps_what_a_longer_drive_has_done(tmp_path, monkeypatch):
     sys.modules.pop("fails", None)
     config = DriveConfig("fails:Fails", traffic=("replay",), limit=4)
     (tmp_path / "fail").touch()
-    with pytest.raises(RuntimeError, match="no more"):
+    with pytest.raises(KeyboardInterrupt, match="no more"):
         drive(config, tmp_path / "out")
     (tmp_path / "fail").unlink()
     (tmp_path / "driven").unlink()
@@ -400,7 +400,7 @@ class Unmade:
 """
 
 
-def test_a_planner_that_quits_fails_like_any_other_and_keeps_what_it_has_driven(tmp_path, monkeypatch, capsys):
+def test_a_planner_that_quits_fails_like_any_other(tmp_path, monkeypatch, capsys):
     (tmp_path / "quits.py").write_text(QUITTING_PLANNER)
     (tmp_path / "script.py").write_text("import sys\nsys.exit(3)\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -409,7 +409,6 @@ def test_a_planner_that_quits_fails_like_any_other_and_keeps_what_it_has_driven(
     out = tmp_path / "out"
     words = ["--data", "synthetic", "--out", str(out), "--limit", "2", "--traffic", "replay"]
     messages = {
-        "quits:Quits": f"planner Quits calls exit(None) in scenario {ids[1]}: let it raise an error",
         "quits:Unmade": "planner 'quits:Unmade' calls exit('no license') when it is made: let it raise an error",
         "script:Any": "planner 'script:Any' cannot be imported (SystemExit: 3)",
     }
@@ -417,9 +416,85 @@ def test_a_planner_that_quits_fails_like_any_other_and_keeps_what_it_has_driven(
         capsys.readouterr()
         assert main(["drive", planner, *words]) == 2
         assert capsys.readouterr().err.splitlines()[-1].startswith(f"rlftsim: {message}")
-    assert [path.stem for path in (out / "quits.Quits-replay.parts").glob("*.json")] == [ids[0]]
-    (tmp_path / "first").write_text(ids[1])
-    assert main(["drive", "quits:Quits", *words]) == 0
+    assert main(["drive", "quits:Quits", *words]) == 1
+    assert f"planner Quits fails at step 0 of scenario {ids[1]}: exit(None)" in capsys.readouterr().out
+    assert [*DriveResult.read(out / "quits.Quits-replay.parquet").failures] == [ids[1]]
+
+
+WEAK_PLANNER = """
+import numpy as np
+class Weak:
+    def __init__(self, throttle=1.0, *, breaks_at=None):
+        if throttle > 1:
+            raise ValueError("throttle above 1")
+        self.throttle, self.breaks_at = throttle, breaks_at
+    def reset(self, info):
+        self.step, self.breaks = 0, info["scenario"] == self.breaks_at
+    def act(self, observation):
+        self.step += 1
+        if self.breaks and self.step == 4:
+            raise IndexError("no lane")
+        return np.array([self.throttle, 0.3], np.float32)
+def steer(observation, turn=0.0):
+    return np.array([0.0, turn], np.float32)
+"""
+
+
+def test_a_planner_that_fails_in_a_scenario_drives_the_others(tmp_path, monkeypatch, capsys):
+    (tmp_path / "weak.py").write_text(WEAK_PLANNER)
+    monkeypatch.syspath_prepend(tmp_path)
+    ids = open_dataset("synthetic", "validation").scenario_ids[:3]
+    planner = f"weak:Weak(throttle=1.0, breaks_at='{ids[1]}')"
+    words = ["drive", planner, "--data", "synthetic", "--limit", "3", "--traffic", "replay"]
+    assert main([*words, "--out", str(tmp_path / "out"), "--film", "worst:2"]) == 1
+    text = capsys.readouterr().out
+    assert f"planner Weak fails at step 3 of scenario {ids[1]}: IndexError: no lane (weak.py:13 in act)" in text
+    assert "failed in 1 of 3 scenarios, which the means leave out" in text
+    assert "leaves the road" in text
+    (path,) = (tmp_path / "out").glob("*.parquet")
+    result = DriveResult.read(path)
+    assert np.isnan(result.values("nuplan_style")).tolist() == [False, True, False]
+    assert {film.stem for film in (tmp_path / "out").glob("*.webp")} == {ids[0], ids[2]}
+    # the same rows where it does not fail
+    (whole,) = drive(DriveConfig("weak:Weak", traffic=("replay",), limit=3))
+    assert whole.failures == {}
+    np.testing.assert_equal(result.values("progress")[[0, 2]], whole.values("progress")[[0, 2]])
+
+
+def test_options_of_a_planner_are_written_behind_its_name(tmp_path, monkeypatch):
+    (tmp_path / "weak.py").write_text(WEAK_PLANNER)
+    monkeypatch.syspath_prepend(tmp_path)
+    sys.modules.pop("weak", None)
+    assert load_planner("weak:Weak(throttle=0.5)").throttle == 0.5
+    assert load_planner("weak:steer(turn=0.25)").act({})[1] == 0.25
+    assert hash_code("weak:Weak(throttle=0.5)") == hash_code("weak:steer(turn=1)") == hash_file(tmp_path / "weak.py")
+    wrong = {
+        "weak:Weak(0.5)": "write options by keyword",
+        "weak:Weak(throttle=open('x'))": "write options by keyword",
+        "weak:Weak(throttle=": "write options by keyword",
+        "weak:Weak(speed=3)": r"cannot be made with speed \(TypeError: .*speed",
+        "weak:Weak(throttle=2)": r"cannot be made with throttle \(ValueError: throttle above 1",
+        "weak:steer(gain=2)": "cannot be made with gain",
+        "idm(speed=3)": "cannot be made with speed",
+    }
+    for name, message in wrong.items():
+        with pytest.raises(ConfigError, match=message):
+            load_planner(name)
+
+
+def test_the_worst_scenarios_are_named_with_what_the_planner_does_there(tmp_path):
+    names = ("free", "slow")
+    movers = {"free": (Mover(speed_mps=9.3),), "slow": (Mover(speed_mps=9.3), Mover(x_m=30.0, speed_mps=3.0))}
+    write_dataset([build_scenario(name, movers[name]) for name in names], tmp_path, split="validation")
+    results = drive(DriveConfig("constant_velocity", data=str(tmp_path), traffic=("replay", "constant_velocity")))
+    worst, *_ = rank_scenarios(results)
+    assert (worst.scenario_id, worst.score) == ("slow", 0.0)
+    assert "at fault for a collision" in worst.causes
+    assert choose_films(results, "failures") == ["slow"]
+    assert choose_films(results, "worst:9") == ["slow", "free"]
+    for wrong in ("worst", "worst:0", "best"):
+        with pytest.raises(ConfigError, match="film must be first, failures, or worst:N"):
+            DriveConfig("idm", film=wrong)
 
 
 def test_a_full_disk_is_noticed_before_anything_is_driven(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Bridges: what is above or below a road is not on it; slopes and ramps hide nothing."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,29 @@ def test_a_parked_car_under_or_over_the_road_is_not_met(road, up, height_m):
     assert (result.planner.time_to_collision, result.planner.least_ttc_s) == (1.0, 3.0)
     assert result.planner.nuplan_style > 0.8
     assert driven("replay", build_scenario("flat", (EGO, BELOW), junction_map())).planner.at_fault_collision_rate == 1.0
+
+
+@pytest.mark.parametrize("aside_m", [2.5, -3.0])
+@pytest.mark.parametrize("has_lanes", [True, False])
+@pytest.mark.parametrize(("height_m", "meets"), [(0.0, True), (1.8, False), (6.0, False)])
+def test_a_car_below_is_not_met_where_its_center_is_beside_the_road(aside_m, has_lanes, height_m, meets):
+    beside = replace(BELOW, y_m=aside_m)
+    no_lanes = polylines([(MapFeatureType.LINE_BROKEN_SINGLE_YELLOW, [(-60.0, 1.8), (140.0, 1.8)])])
+    drawn = build_scenario("aside", (EGO, beside), straight_map() if has_lanes else no_lanes)
+    result = driven("replay", raised(drawn, lambda x: np.full_like(x, height_m), ROAD, (0,)))
+    assert (len(result.record.collisions), result.planner.least_ttc_s < 3.0) == (meets, meets)
+
+
+@pytest.mark.parametrize(("height_m", "meets"), [(1.5, True), (1.65, False), (2.4, False)])
+def test_boxes_meet_where_their_heights_overlap(height_m, meets):  # all boxes are 1.6 m high
+    result = driven("replay", bridge(EGO, BELOW, height_m=height_m))
+    assert (len(result.record.collisions), result.planner.least_ttc_s < 3.0) == (meets, meets)
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+def test_planners_drive_over_a_roof_just_below(name):
+    below = driven(name, bridge(EGO, BELOW, height_m=1.65)).record.agent_motion
+    np.testing.assert_array_equal(below, driven(name, bridge(EGO, height_m=1.65)).record.agent_motion)
 
 
 def test_films_mark_no_overlap_of_cars_above_each_other():

@@ -1,6 +1,7 @@
 """The loop of a planner and the traffic model: the same dice as `simulate`, forks, snapshots, the log itself."""
 
 import hashlib
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load, save
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv, parallel_env
 from rlftsim.envs.episode import advance
@@ -18,7 +20,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import open_dataset
-from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 from scenes import Mover, bend, build_scenario, junction_with_light, straight_road, with_gaps, without_future
 
 
@@ -196,6 +198,40 @@ def test_snapshots_of_something_else_are_refused(data):
     env.restore(saved)
 
 
+def test_a_changed_snapshot_with_a_right_checksum_is_refused_in_one_line():
+    env = EgoEnv(scenarios=[bend()], traffic="replay", stop_on=())
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(2, np.float32))
+    saved = env.snapshot()
+    arrays = load(saved[:-32])
+    motion, about = arrays["motion"], json.loads(arrays["about"].tobytes())
+    scenario_id = about["scenarios"][0]
+    begins_elsewhere, jumps, far = motion.copy(), motion.copy(), motion.copy()
+    begins_elsewhere[0, 0, 0] += 1.0
+    jumps[2:, 0, 1] += 50.0
+    far[2:] *= 1e200
+    for changed_about, changed_motion, cause in (
+        ({"goals": {scenario_id: {"abc": [1, 2]}}}, motion, "abc"),
+        ({"scenarios": []}, motion, "its scenarios cannot be used"),
+        ({"scenarios": [["a"]]}, motion, "its scenarios cannot be used"),
+        ({"dice": [[]]}, motion, "its dice are not of 1 scenarios"),
+        ({"dice": about["dice"] * 2}, motion, "its dice are not of 1 scenarios and 1 decisions"),
+        ({"dice": [5]}, motion, "not iterable"),
+        ({}, motion[:0], "its motion has -1 steps"),
+        ({}, np.repeat(motion, 40, 0), "its motion has 159 steps, not 0 to 80"),
+        ({}, motion.astype(np.float32), "its motion cannot be used"),
+        ({}, far, "its motion cannot be used"),
+        ({}, begins_elsewhere, "does not begin as the log"),
+        ({}, jumps, r"agent \d+ in scenario .* jumps by 50 m at step 2"),
+    ):
+        text = np.frombuffer(json.dumps({**about, **changed_about}).encode(), np.uint8)
+        body = save({"motion": np.ascontiguousarray(changed_motion), "about": text})
+        with pytest.raises(DataError, match=rf"^a damaged snapshot \(.*{cause}.*\): take a new one with snapshot"):
+            env.restore(body + hashlib.sha256(body).digest())
+    env.restore(saved)
+
+
 def test_replayed_agents_stand_in_a_gap_of_their_log_and_leave_with_its_end():
     env = EgoEnv(scenarios=[with_gaps()], traffic="replay", stop_on=())
     env.reset(seed=0)
@@ -292,6 +328,50 @@ def test_idm_traffic_backs_up_as_in_its_log(speed):
     assert now[2] == pytest.approx(0.5, abs=1e-3)
     np.testing.assert_allclose(now[:2], logged[:2], atol=0.2)
     np.testing.assert_allclose(now[3:], logged[3:], atol=0.3)
+
+
+def shuttling(acceleration_mps2, speed_mps=-3.0, heading_rad=0.5):
+    """A log of a vehicle that backs up, stops, and goes on forward (or the other way around)."""
+    log = build_scenario("turning", (Mover(x_m=60.0, y_m=30.0), Mover(x_m=10.0, heading_rad=heading_rad)))
+    time = STEP_S * (np.arange(91) - CURRENT_STEP)
+    speed = speed_mps + acceleration_mps2 * np.maximum(time, 0.0)
+    forward = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+    tracks, row = log.tracks, log.simulated_indices[1]
+    position, velocity = tracks.position.copy(), tracks.velocity.copy()
+    way = np.append(0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * STEP_S))
+    position[row, :, :2] += ((way - way[CURRENT_STEP]) - 8.0 * time)[:, None] * forward
+    velocity[row] = speed[:, None] * forward
+    return replace(log, tracks=replace(tracks, position=position, velocity=velocity))
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration"), [(-3.0, 0.6), (-3.0, 1.5), (-3.0, 2.5), (3.0, 0.6), (3.0, 2.5), (-1.2, 0.6), (-1.2, 1.5)]
+)
+def test_idm_traffic_stops_before_it_goes_the_other_way(speed, acceleration):
+    log = shuttling(-np.sign(speed) * acceleration, speed)
+    world = build_world([log], None, rules={"ego": "planner", "vehicles": "idm", "*": "replay"})
+    state = begin(world, [Dice(0)])
+    motion = [state.motion[0, 1]]
+    for _ in range(80):
+        state = step_world(world, state, world.logged[0, :1, CURRENT_STEP])
+        motion.append(state.motion[0, 1])
+    motion = np.array(motion)
+    forward = motion[:, 3] * np.cos(0.5) + motion[:, 4] * np.sin(0.5)
+    assert np.sign(forward[-1]) == -np.sign(speed)
+    assert np.abs(np.diff(forward)).max() <= 3.02 * STEP_S
+    np.testing.assert_allclose(motion[:, 2], 0.5, atol=1e-3)
+    moved = np.linalg.norm(np.diff(motion[:, :2], axis=0), axis=1) / STEP_S
+    np.testing.assert_allclose(moved, np.abs(forward[1:] + forward[:-1]) / 2, atol=0.35, rtol=0.4)
+    way = np.append(0.0, np.cumsum(moved * np.sign(forward[1:]) * np.sign(speed))) * STEP_S
+    assert way.max() == pytest.approx(speed**2 / 2 / acceleration, abs=0.3)  # it turns where its log does
+
+
+def test_traffic_of_smart_that_backs_up_starts_without_a_jump(model):
+    log = build_scenario("backing", (Mover(x_m=60.0, y_m=30.0), Mover(x_m=10.0, speed_mps=-5.0)))
+    world = build_world([log], model, rules={"ego": "planner", "*": "policy"})
+    state = begin(world, [Dice(0)])
+    moved = step_world(world, state, world.logged[0, :1, CURRENT_STEP]).motion[0, 1, :2] - state.motion[0, 1, :2]
+    assert np.linalg.norm(moved) < 1.0
 
 
 def test_lights_hold_their_last_state_where_a_log_ends():

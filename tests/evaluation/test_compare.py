@@ -15,6 +15,7 @@ from made_up import evaluation
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.compare import compare, compare_paired, format_comparison, format_table
 from rlftsim.evaluation.results import Evaluation
+from rlftsim.jobs.progress import print_wide
 
 
 def render(table):
@@ -126,8 +127,29 @@ def test_scenarios_without_a_meta_metric_are_counted_beside_the_mean():
 def test_a_comparison_is_shown_with_its_verdict():
     text = render(format_comparison(compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))))
     assert "tuned against base: 2 scenarios in both" in text
-    assert "+0.1050 ± 0.0050" in text
-    assert "difference, for the better" in text
+    assert "0.5000  0.6050  +0.1050" in text
+    assert "+0.041  +0.169  0.03  better" in text
+
+
+def test_a_comparison_needs_80_characters_and_nothing_is_cut(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    comparison = compare(evaluation("demo-base", [0.4, 0.6, 0.5]), evaluation("demo-tuned", [0.5, 0.71, 0.5]))
+    print_wide(format_comparison(comparison), format_table(comparison.a, comparison.b))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+    assert text.count("RMM ↑") == 2
+    assert all(line.count("0.") >= 4 for line in text.splitlines() if line.strip().startswith("RMM ↑"))
+
+
+def test_words_of_a_verdict_claim_no_equality_that_was_not_shown():
+    cells = {
+        "better": ([0.1, 0.2, 0.3], [0.2, 0.3, 0.41]), "worse": ([0.2, 0.3, 0.41], [0.1, 0.2, 0.3]),
+        "unclear": ([0.1, 0.2, 0.3], [0.2, 0.1, 0.31]), "equal": ([0.1, 0.2], [0.1, 0.2]),
+    }  # fmt: skip
+    for verdict, (a, b) in cells.items():
+        row = compare(evaluation("a", a), evaluation("b", b))["meta_metric"]
+        assert row.cells[-1] == verdict
 
 
 def test_files_of_another_version_are_refused(tmp_path):

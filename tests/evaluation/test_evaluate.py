@@ -394,9 +394,7 @@ def test_a_file_is_no_folder_and_a_folder_no_file_before_anything_is_simulated(d
     ):
         evaluate("oracle", data, tmp_path / "a.parquet", CONFIG, name="x")
     (tmp_path / "x.parquet").mkdir()
-    with pytest.raises(
-        ConfigError, match=r"x\.parquet is a folder: pass another name for the evaluation, or remove it"
-    ):
+    with pytest.raises(DataError, match=r"x\.parquet is a folder, not a file: choose another .* name, or remove it"):
         evaluate("oracle", data, tmp_path, CONFIG, name="x")
     assert [path.name for path in tmp_path.iterdir()] == ["x.parquet"]
 

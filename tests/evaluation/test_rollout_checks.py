@@ -79,14 +79,29 @@ def test_positions_whose_squares_no_number_holds_are_far(warnings_of):
             lambda v: v + np.pi / 2,
             "6 of 6 agents do not begin with the heading .* 90 degrees from it in r",
         ),
+        ("heading", lambda v: v + np.radians(30), "6 of 6 agents do not begin with the heading .* 30 degrees from it"),
         ("heading", lambda v: v + np.pi, "6 of 6 agents do not begin with the heading .* 180 degrees from it in r"),
-        ("heading", lambda v: v + torch.arange(80.0).clip(max=8) / 5, "4 of 4 paths .* faster than 3 m/s go sideways"),
+        ("heading", lambda v: v + torch.arange(80.0).clip(max=8) / 5, "4 of 4 .* faster than 3 m/s go sideways"),
+        (
+            "heading",
+            lambda v: v + torch.arange(80.0).clip(max=8) / 15,
+            "4 of 4 .* more than 20 degrees off the heading",
+        ),
     ],
 )
 def test_what_no_road_user_does_is_told(warnings_of, axis, change, text):
     states = logged_states(SCENARIO, num_rollouts=1)
     lines = "\n".join(warnings_of(replace(states, **{axis: change(getattr(states, axis))})))
     assert re.search(text, lines), lines
+
+
+@pytest.mark.parametrize("change", [torch.full((80,), 1.5), torch.arange(80.0).clip(max=8) / 5])
+def test_headings_of_a_minority_of_rollouts_are_no_doubt_about_the_scenario(warnings_of, change):
+    log = logged_states(SCENARIO, num_rollouts=1)
+    x, y, z, heading = (values.repeat(8, 1, 1) for values in (log.x, log.y, log.z, log.heading))
+    for count, is_told in ((3, False), (5, True)):
+        turned = heading + (torch.arange(8) < count)[:, None, None] * change
+        assert bool(warnings_of(SimulatedStates(log.object_id, x, y, z, turned))) == is_told
 
 
 def test_files_with_agents_and_rollouts_exchanged_are_scored_with_a_warning(tmp_path, capsys):

@@ -18,8 +18,8 @@ from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.evaluation.wire_format import iterate_fields
 from rlftsim.jobs.arrays import read_npz
 from rlftsim.rollout.baselines import ConstantVelocity
-from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 
 FUZZ = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -19,8 +19,8 @@ from rlftsim.evaluation.scenario_source import open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
-from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset

@@ -14,8 +14,7 @@ from rlftsim.goals.attainment import (
     measure_outcome,
     rate,
 )
-from rlftsim.goals.logged import logged_endpoints, logged_goals
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, logged_endpoints, logged_goals
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.realism.miss import compute_miss_rates
 from rlftsim.scenario.batch import collate

@@ -1,14 +1,17 @@
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 import rlftsim
 from rlftsim.errors import CheckpointError, DataError
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import check_columns, map_arrow, read_parquet, read_parquet_metadata
 
 PACKAGE = Path(rlftsim.__file__).parent
@@ -84,6 +87,75 @@ def test_a_shard_is_mapped_and_its_batches_are_as_many_as_its_end_says(tmp_path)
         (tmp_path / "cut.arrow").write_bytes(data[:size])
         with pytest.raises(DataError, match="is damaged"):
             map_arrow(tmp_path / "cut.arrow", "convert again")
+
+
+def repeat_text(num_rows, num_bytes):
+    text = pa.array(["x" * num_bytes])
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(num_rows, np.int32)), text)
+
+
+BOMBS = {
+    "texts": (lambda: repeat_text(20_000, 1_000_000), {"dictionary_pagesize_limit": 1 << 30}),
+    "texts-v2": (
+        lambda: repeat_text(20_000, 1_000_000),
+        {"dictionary_pagesize_limit": 1 << 30, "data_page_version": "2.0"},
+    ),
+    "texts-in-a-list": (lambda: in_a_list(repeat_text(20_000, 1_000_000)), {}),
+    "a-long-list": (lambda: in_a_list(pa.array(np.zeros(150_000_000))), {}),
+    "a-long-text": (lambda: ["y" * 1_500_000_000], {"use_dictionary": False, "write_statistics": False}),
+    "differences": (
+        lambda: [f"{'z' * 100_000}{number}" for number in range(12_000)],
+        {"use_dictionary": False, "column_encoding": {"a": "DELTA_BYTE_ARRAY"}},
+    ),
+}
+
+
+def in_a_list(values):
+    return pa.ListArray.from_arrays(pa.array([0, len(values)], pa.int32()), values)
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_small_file_that_unfolds_to_more_than_memory_holds_is_refused(name, tmp_path):
+    make_column, settings = BOMBS[name]
+    table = pa.table({"a": make_column()})
+    pq.write_table(table, tmp_path / "a.parquet", compression="zstd", store_schema=False, **settings)
+    command = [sys.executable, "-c", READ_BOMB, str(tmp_path / "a.parquet")]
+    message, peak = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    assert message.endswith("a.parquet: cannot be read (it unfolds to more than its size explains): get it again.")
+    assert int(peak) < 3 << 29
+
+
+READ_BOMB = """
+import resource, sys
+from rlftsim.errors import DataError
+from rlftsim.jobs.tables import read_parquet
+
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, resource.getrlimit(resource.RLIMIT_AS)
+try:
+    read_parquet(sys.argv[1], "get it again")
+except DataError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before[0]) << 10)
+assert resource.getrlimit(resource.RLIMIT_AS) == before[1]
+"""
+
+
+def test_a_named_pipe_is_refused_where_a_file_is_read(tmp_path):
+    os.mkfifo(tmp_path / "a.parquet")
+    for read in (read_parquet, map_arrow, read_json):
+        with pytest.raises(DataError, match="a pipe, not a file"):
+            read(tmp_path / "a.parquet", "write it again")
+    assert read_parquet_metadata(tmp_path / "a.parquet") == {}
+
+
+def test_texts_that_are_repeated_within_reason_are_read(tmp_path):
+    names = [f"{'name' * 20}-{number % 3000}" for number in range(200_000)]
+    table = pa.table({"by dictionary": names, "by differences": sorted(names), "in a list": [[name] for name in names]})
+    pq.write_table(
+        table, tmp_path / "a.parquet", use_dictionary=["by dictionary", "in a list.list.element"],
+        column_encoding={"by differences": "DELTA_BYTE_ARRAY"},
+    )  # fmt: skip
+    assert read_parquet(tmp_path / "a.parquet", "get it again").equals(table)
 
 
 def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tmp_path, monkeypatch):

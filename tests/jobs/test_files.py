@@ -3,6 +3,7 @@
 import errno
 import os
 import resource
+import socket
 import stat
 import subprocess
 import sys
@@ -46,8 +47,24 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
 def test_what_killed_writers_left_of_a_file_is_removed_and_nothing_else(tmp_path):
     for name in (".a[1].json.host.12.tmp", ".a[1].json.other-host.7.tmp", ".b.json.host.12.tmp", "a[1].json"):
         (tmp_path / name).touch()
-    remove_temporaries(tmp_path / "a[1].json")
+    remove_temporaries([tmp_path / "a[1].json"])
     assert names(tmp_path) == [".b.json.host.12.tmp", "a[1].json"]
+
+
+def test_what_a_living_process_or_another_program_writes_stays(tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    (tmp_path / "inner").mkdir()
+    host, parent = socket.gethostname(), os.getppid()
+    left, *others = (
+        f".a.json.{host}.{ended.pid}.tmp", f".a.json.{host}.{parent}.tmp", f".b.json.{host}.{ended.pid}.tmp",
+        f"inner/.a.json.{host}.{ended.pid}.tmp", ".x.123.tmp", ".a.json.123.tmp",
+    )  # fmt: skip
+    for name in (left, *others):
+        (tmp_path / name).touch()
+    remove_temporaries([tmp_path / "a.json"])
+    assert not (tmp_path / left).exists()
+    assert all((tmp_path / name).exists() for name in others)
 
 
 def test_an_interrupted_write_leaves_nothing(tmp_path):

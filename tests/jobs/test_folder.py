@@ -1,10 +1,24 @@
 """A folder holds one type of result, whatever the verb: others are refused before anything is written."""
 
+import os
+from pathlib import Path
+
 import pytest
 
 from rlftsim.cli import main
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.folder import MARKERS, check_file, check_folder, check_name, recognize_folder
+from rlftsim.evaluation.resumable import ScenarioValues, read_finished
+from rlftsim.jobs.folder import (
+    MARKERS,
+    Lease,
+    check_file,
+    check_folder,
+    check_name,
+    find_differences,
+    recognize_folder,
+)
+from rlftsim.jobs.items import read_stored
+from rlftsim.jobs.runner import Inline
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
@@ -97,6 +111,21 @@ def test_files_that_make_a_data_set_are_not_replaced_by_a_goals_file(data, capsy
     assert "manifest.json is part of a data set: choose another file" in capsys.readouterr().err
     assert contents(data) == before
     check_file(data / "goals.json")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_no_file_in_place_of_a_result_is_refused_instead_of_waited_for(make, tmp_path):
+    make(path := tmp_path / "result.json")
+    values = ScenarioValues(tmp_path, ["result"], {"result": {}}, lambda _, values: values)
+    for read in (
+        lambda: find_differences(path, {}, "remove it"),
+        lambda: read_stored(path, Path.read_bytes),
+        lambda: read_finished(path, Path.read_bytes),
+        lambda: Lease(path, Inline(), "works in"),
+        lambda: values.read(range(1)),
+    ):
+        with pytest.raises(DataError, match=r"result\.json is (a folder|a pipe or device), not a file: choose another"):
+            read()
 
 
 @pytest.mark.parametrize("name", ["", " ", ".", "..", "a/b", "a\nb", "a\x1b[31mb", "a\\b", "x" * 300, "\udcff"])

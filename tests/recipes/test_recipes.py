@@ -18,7 +18,8 @@ from rlftsim.recipes.settings import list_sections
 from rlftsim.recipes.smart import SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
 from rlftsim.recipes.trafficbots import TrafficBotsRecipe
 from rlftsim.rollout.baselines import ConstantVelocity
-from rlftsim.scenario.open import dataset_folder, open_dataset
+from rlftsim.scenario.dataset import dataset_folder
+from rlftsim.scenario.open import open_dataset
 from rlftsim.tokens.clustering import build_vocabulary
 
 SHIPPED = [

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rlftsim.errors import ConfigError
-from rlftsim.realism import AgentScores, batch, compute_credit
+from rlftsim.realism import AgentScores, compute_credit, meta_metric
 from rlftsim.rewards import (
     REWARDS,
     compute_rewards,
@@ -178,13 +178,13 @@ def test_a_split_that_takes_other_arguments_is_refused(outside):
 @pytest.mark.parametrize("credit", ["rollout", "agent"])
 def test_all_rewards_together_measure_a_rollout_once(credit, measured, monkeypatch):
     _, rollouts, scenarios, _ = measured
-    original, calls = batch.compute_features, []
+    original, calls = meta_metric.compute_features, []
 
     def counted(*args, **options):
         calls.append(1)
         return original(*args, **options)
 
-    monkeypatch.setattr(batch, "compute_features", counted)
+    monkeypatch.setattr(meta_metric, "compute_features", counted)
     config = FinetuneConfig(reward=EVERYTHING, credit=credit)
     realism, rewards = compute_reward(scenarios, rollouts, config)
     assert len(calls) == scenarios.num_scenarios

@@ -38,7 +38,7 @@ def test_the_first_contradictory_track_is_named_with_its_speeds(tracks):
 
 
 def test_headings_in_degrees_or_from_north_contradict_the_motion(tracks):
-    for heading in (np.rad2deg(tracks.heading + np.pi / 2), np.pi / 2 - tracks.heading):
+    for heading in (np.rad2deg(tracks.heading + np.pi / 2), np.pi / 2 - tracks.heading, tracks.heading + 0.5):
         assert describe_contradictions(replace(tracks, heading=heading.astype(np.float32))).startswith("headings ")
 
 
@@ -67,11 +67,44 @@ def test_heights_that_are_none_contradict_the_motion(tracks):
     assert describe_contradictions(replace(tracks, position=position)) == ""
 
 
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda z: z + 30, "heights (z) contradict the map near 5 of 5 moving tracks: track 100 is at 33.0 m, the m"),
+        (lambda z: z - 8, "heights (z) contradict the map near 5 of 5 moving tracks: track 100 is at -5.0 m, the m"),
+        (lambda z: z + 4 * (np.arange(91) > 40), "heights (z) jump in 6 of 6 tracks: track 100 climbs or falls by 4"),
+    ],
+    ids=["above", "below", "jump"],
+)
+def test_heights_of_another_frame_contradict_the_map_and_none_jumps(tracks, change, text):
+    scenario = scenes.straight_road()
+    position = tracks.position.copy()
+    position[..., 2] = change(position[..., 2])
+    moved = replace(tracks, position=position)
+    assert describe_contradictions(tracks, scenario.map_features) == ""
+    assert text in describe_contradictions(moved, scenario.map_features)
+    assert describe_contradictions(moved, scenario.map_features, guessed={"z"}) == ""
+
+
+def test_tracks_on_either_level_of_a_bridge_and_far_from_the_map_are_on_its_heights(tracks):
+    ground = scenes.straight_road().map_features
+    position = tracks.position.copy()
+    position[::2, :, 2] += 8
+    both = np.concatenate([ground.points, ground.points + np.float32([0, 0, 8])])
+    moved = replace(tracks, position=position)
+    assert describe_contradictions(moved, replace(ground, points=both)) == ""
+    assert describe_contradictions(moved, replace(ground, points=ground.points + np.float32([500, 0, 0]))) == ""
+
+
+def contradictions(scenario):
+    return describe_contradictions(scenario.tracks, scenario.map_features, scenario.guessed)
+
+
 def test_synthetic_scenarios_do_not_contradict_themselves():
-    assert not any(describe_contradictions(scenario.tracks) for scenario in ScenarioDataset("synthetic", cache_size=0))
+    assert not any(map(contradictions, ScenarioDataset("synthetic", cache_size=0)))
 
 
 @pytest.mark.official
 def test_real_scenarios_do_not_contradict_themselves(shared):
     files = sorted((shared / "data" / "womd").rglob("*.tfrecord"))
-    assert not any(describe_contradictions(scenario.tracks) for file in files for scenario in read_scenarios(file))
+    assert not any(contradictions(scenario) for file in files for scenario in read_scenarios(file))

@@ -111,7 +111,7 @@ def test_bad_records_are_skipped_and_reported(source, tmp_path, make_message, ma
     (source / "training" / "empty.tfrecord").touch()
     report = run(source, tmp_path / "data")
     assert report.converted == 5
-    assert [(s.file, s.record, s.cause.split(":")[0]) for s in report.skipped] == [
+    assert [(s.file, s.record, s.cause.removeprefix("scenario bad: ").split(":")[0]) for s in report.skipped] == [
         ("training/empty.tfrecord", 0, "the file is empty"),
         (
             "training/training.tfrecord-00001-of-00002",
@@ -334,11 +334,12 @@ def test_an_empty_file_is_named(tmp_path, capsys):
 def test_only_temporaries_of_killed_conversions_are_removed(source, tmp_path):
     run(source, tmp_path / "data")
     expected = contents(tmp_path / "data")
-    for name in ("notes.tmp", "shards/.mine.tmp", "mine/.draft.2.txt.tmp"):
+    [shard, *_] = (tmp_path / "data" / "shards" / "training").iterdir()
+    for name in ("notes.tmp", "shards/.mine.tmp", "mine/.draft.2.txt.tmp", "shards/.x.123.tmp"):
         (tmp_path / "data" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "data" / name).write_text("of the user")
         expected[name] = b"of the user"
-    (tmp_path / "data" / "shards" / "training" / ".a.arrow.machine.12.tmp").write_text("cut short")
+    (tmp_path / "data" / "shards" / "training" / f".{shard.name}.machine.12.tmp").write_text("cut short")
     run(source, tmp_path / "data")
     assert contents(tmp_path / "data") == expected
 

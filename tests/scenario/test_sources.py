@@ -151,10 +151,10 @@ def test_an_unsound_scenario_of_any_source_is_a_bad_record(make_message):
         def describe(self):
             return {}
 
-    skipped = []
-    read = list(read_unit(Yields(), Unit("x", ()), on_error="skip", report=skipped.append))
-    assert read == [(1, good)]
-    assert [one.record for one in skipped] == [0, 2]
+    first, read, last = read_unit(Yields(), Unit("x", ()), on_error="skip")
+    assert read == (1, good)
+    skipped = [item for _, item in (first, last)]
+    assert [(number, item.record) for number, item in (first, last)] == [(0, 0), (2, 2)]
     assert "scenario bad: object id 7 belongs to 3 tracks" in str(skipped[0])
     assert "scenario lost: track 100 has a NaN or infinite heading at step 3" in str(skipped[1])
 

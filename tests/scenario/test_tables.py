@@ -133,6 +133,7 @@ BAD = {
     "map id": ({"scenarios": [{**ROW, "map_id": "n"}], "map_rows": NAMED_MAP}, "row 0: map n has no rows in map.parq"),
     "no map id": ({"map_rows": NAMED_MAP}, "scenarios.parquet has no column map_id"),
     "speed limit": ({"lanes": [{**LANE, "speed_limit_mph": np.inf}]}, "lanes.parquet: row 0: speed_limit_mph is inf"),
+    "speed limit beyond float32": ({"lanes": [{**LANE, "speed_limit_mph": 1e300}]}, "speed_limit_mph is 1e\\+300"),
     "stop point": ({"lights": [{**LIGHT, "x": np.nan, "y": 0.0}]}, "lights.parquet: row 0: x is nan"),
     "predict": ({"scenarios": [{**ROW, "predict": [5]}]}, "predict lists object 5"),
     "rate": ({"scenarios": [{**ROW, "step_s": 2.0}]}, "step_s is 2, it must lie between"),
@@ -147,6 +148,10 @@ BAD = {
     "across": ({"tracks": [{**r, "vx": 0.0, "vy": 9.0} for r in TWO]}, "tracks.parquet: velocities contradict"),
     "time base": ({"scenarios": [{**ROW, "step_s": 0.2}]}, "moves at 5.0 m/s, its velocity is 10.0 m/s and"),
     "headings": ({"tracks": [{**r, "heading": 1.4} for r in TWO]}, "tracks.parquet: headings contradict the motion"),
+    "heights": (
+        {"tracks": [{**r, "z": 40.0} for r in TWO], "map_rows": [{**r, "z": 0.0} for r in MAP]},
+        r"tracks.parquet: heights \(z\) contradict the map near 2 of 2 moving tracks: track . is at 40.0 m",
+    ),
     "predict twice": ({"scenarios": [{**ROW, "predict": [8, 8]}]}, "row 0: predict lists object 8 twice"),
     "lane twice": ({"lanes": [LANE, LANE]}, "lanes.parquet: row 1: a second row with lane_id 1"),
     "light twice": ({"lights": [LIGHT, {**LIGHT, "state": "go"}]}, "row 1: a second row with lane_id 1, step 0"),

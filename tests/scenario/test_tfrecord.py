@@ -3,7 +3,14 @@ import struct
 import pytest
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.tfrecord import count_lost, masked_crc32c, read_records, write_records
+from rlftsim.scenario.tfrecord import (
+    SkippedRecord,
+    count_lost,
+    iterate_records,
+    masked_crc32c,
+    read_records,
+    write_records,
+)
 
 RECORDS = [b"first", b"", b"third record" * 100, b"last"]
 # start of record k: 16 bytes of framing for each record before it
@@ -24,8 +31,10 @@ def flip(path, offset):
 
 
 def read_skipping(path):
-    skipped = []
-    return list(read_records(path, on_error="skip", report=skipped.append)), skipped
+    items = list(enumerate(iterate_records(path)))
+    skipped = [item for _, item in items if isinstance(item, SkippedRecord)]
+    assert all(items[item.record] == (item.record, item) for item in skipped)
+    return [(record, item) for record, item in items if isinstance(item, bytes)], skipped
 
 
 def test_records_come_back_in_order_with_their_numbers(file):
@@ -100,4 +109,4 @@ def test_what_is_no_tfrecord_is_refused_in_words(tmp_path, content, cause):
 
 def test_a_missing_file_is_refused_even_when_skipping(tmp_path):
     with pytest.raises(DataError, match="cannot be opened"):
-        list(read_records(tmp_path / "none", on_error="skip"))
+        list(iterate_records(tmp_path / "none"))

@@ -18,7 +18,7 @@ from PIL import Image
 
 import rlftsim as rs
 from rlftsim.goals.goals_file import read_goals
-from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.studio.notebook import NOTEBOOK_ORIGINS, StudioCell
 from rlftsim.studio.server import static_files

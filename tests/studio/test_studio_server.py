@@ -16,7 +16,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.goals.goals_file import GoalEntry, read_goals
 from rlftsim.goals.placement import goal_warnings
-from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.studio.encoding import MAGIC, encode_poses
 from rlftsim.studio.runs import Worker, split_rollouts

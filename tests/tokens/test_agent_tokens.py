@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import scenes
 from rlftsim.geometry import rotate, wrap_angle
+from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import ObjectType
 from rlftsim.tokens.agent_tokens import (
@@ -18,6 +19,7 @@ from rlftsim.tokens.agent_tokens import (
     class_boxes,
     clean_tracks,
     place_pose,
+    restart_at_log,
     tokenize_agents,
     tokenize_tracks,
 )
@@ -99,6 +101,53 @@ def test_the_nearest_token_is_nearest_by_corners(vocabulary):
     half = torch.tensor([[2.4, 1.0], [2.4, -1.0], [-2.4, -1.0], [-2.4, 1.0]])
     distance = (ends - (half + torch.tensor([3.07, 0.04]))).norm(dim=-1).sum(-1)
     assert int(tokens.token_id[0, 0, 0]) == int(distance.argmin())
+
+
+# ---- where simulations start ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fine_vocabulary():
+    """A vocabulary of many tokens, so that ordinary motions have one nearby."""
+    return load_policy("demo-base").vocabulary
+
+
+BACKING = scenes.Mover(x_m=30.0, y_m=4.0, speed_mps=-5.0)
+
+
+def test_a_simulation_starts_at_the_log_for_those_whom_no_token_leads(fine_vocabulary):
+    fast, late = replace(BACKING, speed_mps=60.0), replace(BACKING, missing=tuple(range(7)))
+    batch = collate([scenes.build_scenario("off", (BACKING, fast, late))])
+    tokens = tokenize_agents(batch, fine_vocabulary)
+    assert ((tokens.position - tokens.logged_position)[0, :, 1].norm(dim=-1) > 2.0).all()
+    history = restart_at_log(tokens, batch, fine_vocabulary)
+    assert torch.equal(history.position[0], batch.position[0, :, 5:11:5] * history.valid[0, ..., None])
+    assert torch.equal(history.heading[0], batch.heading[0, :, 5:11:5] * history.valid[0])
+
+
+def test_the_history_of_all_others_and_the_tokens_to_learn_from_keep_their_bits(fine_vocabulary):
+    batch = collate([scenes.build_scenario("mixed", (*scenes.TRAFFIC, BACKING))])
+    tokens = tokenize_agents(batch, fine_vocabulary)
+    before = {name: values.clone() for name, values in vars(tokens).items()}
+    history = vars(restart_at_log(tokens, batch, fine_vocabulary))
+    assert all(torch.equal(values[:, :-1], before[name][:, :-1, :2]) for name, values in history.items())
+    assert not torch.equal(history["position"], before["position"][:, :, :2])
+    # cached with the scenario
+    after = vars(tokenize_agents(batch, fine_vocabulary))
+    assert all(torch.equal(values, before[name]) for name, values in after.items())
+
+
+def test_a_restarted_agent_has_its_logged_heading_where_tokens_hold_the_one_before_a_jump(fine_vocabulary):
+    scenario = scenes.build_scenario("turned", (replace(BACKING, speed_mps=6.0),))
+    heading = scenario.tracks.heading.copy()
+    heading[0, :3] += np.pi
+    batch = collate([replace(scenario, tracks=replace(scenario.tracks, heading=heading))])
+    tokens = tokenize_agents(batch, fine_vocabulary)
+    assert (tokens.heading[0, 0].abs() > 3.0).all()
+    history = restart_at_log(tokens, batch, fine_vocabulary)
+    assert torch.equal(history.heading[0], batch.heading[0, :, 5:11:5])
+    # the token of 3 m ahead
+    assert fine_vocabulary.poses[0, history.token_id[0, 0, 1], -1, 0] == pytest.approx(3.0, abs=0.2)
 
 
 # ---- cleaning ------------------------------------------------------------------------------------

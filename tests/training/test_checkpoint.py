@@ -150,6 +150,13 @@ def test_a_position_that_is_not_the_folders_is_refused(tmp_path, update):
         read_checkpoint(path, {"policy": module}, optimizer)
 
 
+def test_a_checkpoint_without_a_number_of_its_method_is_refused(tmp_path):
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(2, {"drift.now": 1.0}), {"policy": module}, optimizer)
+    with pytest.raises(CheckpointError, match=r"lacks the number beta: cannot go on from it, delete this folder"):
+        read_checkpoint(path, {"policy": module}, optimizer, ["beta", "drift.now"])
+
+
 def test_a_checkpoint_of_another_model_is_refused(tmp_path):
     module, optimizer = small_run()
     path = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)

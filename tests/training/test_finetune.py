@@ -17,6 +17,7 @@ from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.training import experience
 from rlftsim.training import reward as module
 from rlftsim.training.config import FinetuneConfig, KlConfig
@@ -110,6 +111,14 @@ def test_training_everything_reaches_the_map_encoder(vocabulary, batch, fabric):
 def test_scored_log_probs_equal_the_sampled_ones_and_the_gap_is_logged(learner, batch, fabric):
     values = update_policy(learner, batch, CONFIG, fabric)
     assert 0 <= values["score_gap"] < 1e-4
+
+
+def test_scored_log_probs_equal_the_sampled_ones_of_a_car_that_backs_up(learner, fabric):
+    back = scenes.Mover(x_m=30.0, y_m=4.0, speed_mps=-5.0)
+    batch = collate([scenes.build_scenario("back", (*scenes.TRAFFIC, back))])
+    start = learner.policy.begin(learner.policy.encode(batch), 1, None, torch.zeros(1, 1, batch.heading.shape[1], 0))
+    assert torch.equal(start.position[0, 0, -1], batch.position[0, -1, CURRENT_STEP])
+    assert 0 <= update_policy(learner, batch, CONFIG, fabric)["score_gap"] < 1e-4
 
 
 def test_the_logged_gap_would_show_a_policy_that_is_scored_otherwise_than_sampled(learner, batch, fabric, monkeypatch):

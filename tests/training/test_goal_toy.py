@@ -4,7 +4,7 @@ import fork
 import pytest
 
 import tiny
-from rlftsim.goals.logged import logged_goals
+from rlftsim.goals.types import logged_goals
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training.config import FinetuneConfig, GoalConfig, KlConfig

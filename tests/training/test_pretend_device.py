@@ -16,8 +16,7 @@ import tiny
 from pretend_device import DEVICE, PretendDevice
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig
-from rlftsim.goals.logged import logged_goals
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, logged_goals
 from rlftsim.policies.smart.config import smart_demo, smart_tiny
 from rlftsim.realism import score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -125,7 +124,7 @@ def test_the_device_has_the_gradients_of_the_cpu():
 
 def test_a_table_that_stays_on_the_host_is_found(policy, batch, monkeypatch):
     table = torch.tensor([0, 0, 1, 2, 0])
-    monkeypatch.setattr("rlftsim.policies.smart.model.class_of_type", lambda object_type: table[object_type])
+    monkeypatch.setattr("rlftsim.policies.smart.network.class_of_type", lambda object_type: table[object_type])
     with on_device(), pytest.raises(RuntimeError, match=r"same device.*index"):
         policy.to(DEVICE).encode(batch.to(DEVICE))
 

@@ -15,8 +15,9 @@ from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.config import ValidationConfig
+from rlftsim.training.config import AlarmConfig, ValidationConfig
 from rlftsim.training.monitoring import measure_map_use
+from rlftsim.training.run import TrainingRun
 from rlftsim.training.run_folder import read_metrics
 
 OFTEN = ValidationConfig(every=2, num_scenarios=3, num_rollouts=2, scenarios_per_pass=2)
@@ -27,7 +28,7 @@ def held_out():
     return ScenarioDataset(pack_path(), "validation")
 
 
-@pytest.mark.parametrize("stage", ["pretrain", "catk"])
+@pytest.mark.parametrize("stage", ["pretrain", "catk", "finetune"])
 def test_validation_changes_nothing_of_the_training(stage, vocabulary, drawn_scenarios, held_out, tmp_path):
     for name, settings in (("without", ValidationConfig()), ("with", OFTEN)):
         policy = tiny.tiny_policy(vocabulary)
@@ -37,9 +38,73 @@ def test_validation_changes_nothing_of_the_training(stage, vocabulary, drawn_sce
     assert all(torch.equal(value, with_it[name]) for name, value in without.items())
     lines = read_metrics(tmp_path / "with")
     assert ["validation_rmm" in line for line in lines] == [False, True, False, True]
+    objective = "kl" if stage == "finetune" else "loss"
     for line, other in zip(lines, read_metrics(tmp_path / "without")):
-        assert line["loss"] == other["loss"]
+        assert line[objective] == other[objective]
         assert "validation_rmm" not in other
+
+
+def find_best(run):
+    """Update of the highest lower bound among the validations of a run."""
+    lines = [line for line in read_metrics(run) if "validation_gain_low" in line]
+    return max(lines, key=lambda line: line["validation_gain_low"])["update"]
+
+
+def test_a_fine_tuned_model_is_that_of_the_best_validation_also_where_the_run_was_stopped(
+    vocabulary, drawn_scenarios, held_out, tmp_path, monkeypatch
+):
+    # steps so large that later models are worse
+    options = {
+        "held_out": held_out, "learning_rate": 0.3, "epochs": 1.0, "max_kl": 1e3, "warmup_updates": 0,
+        "validation": ValidationConfig(every=1, num_scenarios=3, num_rollouts=2, keep_best=True),
+    }  # fmt: skip
+    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "whole", **options)
+    best, last = find_best(tmp_path / "whole"), read_metrics(tmp_path / "whole")[-1]["update"]
+    assert best < last
+    model = load_file(tmp_path / "whole" / "model" / "model.safetensors")
+    kept = load_file(tmp_path / "whole" / "best" / f"update-{best:08d}.safetensors")
+    assert all(torch.equal(value, kept[f"network.{name}"]) for name, value in model.items())
+    # the same model where the run stops behind its best validation and goes on
+    monkeypatch.setattr(TrainingRun, "keep_best", stop_behind(TrainingRun.keep_best, best))
+    arguments = ("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "stopped")
+    with pytest.raises(KeyboardInterrupt):
+        tiny.train(*arguments, **options)
+    monkeypatch.undo()
+    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "stopped", **options)
+    resumed = load_file(tmp_path / "stopped" / "model" / "model.safetensors")
+    assert all(torch.equal(value, resumed[name]) for name, value in model.items())
+
+
+def stop_behind(keep_best, update):
+    """A `keep_best` behind which the process ends at an update."""
+
+    def stopped(run, values):
+        keep_best(run, values)
+        if run.learner.update == update:
+            raise KeyboardInterrupt
+
+    return stopped
+
+
+def test_the_gain_is_over_the_start_scenario_by_scenario(vocabulary, drawn_scenarios, held_out, tmp_path):
+    # nothing is learned, so each scenario scores as at the start
+    validation = ValidationConfig(every=2, num_scenarios=3, num_rollouts=2, keep_best=True)
+    options = {"held_out": held_out, "learning_rate": 1e-30, "epochs": 0.5, "validation": validation}
+    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, **options)
+    *_, line = read_metrics(tmp_path)
+    assert (line["validation_gain"], line["validation_gain_low"]) == (0.0, 0.0)
+
+
+def test_a_run_ends_where_an_alarm_is_raised_and_stays_ended(vocabulary, drawn_scenarios, tmp_path, caplog):
+    alarms = AlarmConfig(first_updates=1, window=1, speed_drift_mps=1e-9, stop=True)
+    options = {"alarms": alarms, "learning_rate": 0.3, "epochs": 2.0, "max_kl": 1e3, "warmup_updates": 0}
+    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, **options)
+    updates = read_metrics(tmp_path)[-1]["update"]
+    assert updates < 8
+    assert f"the run ends at update {updates} of 8: alarm_speed: mean speed differs" in caplog.text
+    assert (tmp_path / "model" / "model.safetensors").exists()
+    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, **options)
+    assert read_metrics(tmp_path)[-1]["update"] == updates
 
 
 def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary, drawn_scenarios, held_out, tmp_path):

@@ -18,8 +18,10 @@ from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 
 VERBS = (
-    "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "augment",
-    "model", "goals", "simulate", "drive", "studio", "score", "evaluate", "compare", "submit", "experiment",
+    "demo", "doctor", "plugins", "convert", "data", "synthesize", "recipe", "tokens", "pretrain", "finetune", "runs",
+    "augment", "models", "model", "goals", "simulate", "drive", "failures", "studio", "score", "evaluate", "compare",
+    "submit",
+    "experiment",
 )  # fmt: skip
 """Verbs in the order in which a newcomer needs them."""
 
@@ -39,11 +41,14 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   tokens       build a vocabulary of motion and map tokens, or measure its coverage
   pretrain     train a model on logged tracks
   finetune     fine-tune a model in closed loop with a realism reward, also with goals
+  runs         list training runs: how far they are, how good, and which settings differ
   augment      sample further goals for goal-conditioned fine-tuning
+  models       list the models in the box and those of other packages
   model        average models; import a checkpoint of the public CAT-K code, or export one
   goals        propose goals for agents and write a goals file, or check one
   simulate     roll out scenarios with a model
   drive        let a planner drive among simulated traffic, and score both
+  failures     estimate how often a planner fails in realistic traffic, and show how
   studio       ask agents for things in the browser, and look at what happens
 
   score        score rollouts of any simulator with the official realism meta-metric
@@ -55,10 +60,10 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   join VERB .. put the shares of a command together that ran on several machines (--share K/N)
 """
 
-STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "studio", "compare")
+STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "runs", "models", "model", "goals", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
-HAVE_SHARES = ("augment", "convert", "evaluate", "score", "simulate", "submit build", "synthesize")
+HAVE_SHARES = ("augment", "convert", "evaluate", "failures", "score", "simulate", "submit build", "synthesize")
 """Commands with --share, whose shares `join` puts together."""
 SIGNALLED = 128
 """Added to the number of the signal that ended the command: 130 = Ctrl-C, 143 = SIGTERM, 138 = SIGUSR1."""

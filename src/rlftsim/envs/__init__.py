@@ -16,11 +16,15 @@ except ImportError as error:
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.ego_env import EgoEnv
+from rlftsim.envs.failures import FailureEstimate, estimate_failures
 from rlftsim.envs.parallel import TrafficParallelEnv, parallel_env
 from rlftsim.envs.result import Result
 from rlftsim.envs.vector_env import EgoVectorEnv
 
-__all__ = ["EgoEnv", "EgoVectorEnv", "EnvConfig", "Result", "TrafficParallelEnv", "parallel_env"]
+__all__ = [
+    "EgoEnv", "EgoVectorEnv", "EnvConfig", "FailureEstimate", "Result", "TrafficParallelEnv", "estimate_failures",
+    "parallel_env",
+]  # fmt: skip
 
 if "rlftsim/Ego-v0" not in gymnasium.registry:
     gymnasium.register(

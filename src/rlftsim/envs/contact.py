@@ -13,8 +13,7 @@ from scipy.spatial import KDTree
 from rlftsim.envs.levels import is_on_level
 from rlftsim.envs.scene import SEGMENT_POINTS, Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenario, cached_on_scenario
 
 STOPPED_MPS = 0.05
 """At most this fast an agent counts as stopped."""

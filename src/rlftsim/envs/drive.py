@@ -3,6 +3,8 @@
 Interrupted in any way, the same call goes on where the work stopped, see `evaluation.resumable`.
 """
 
+import math
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +18,19 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, hash_code, load_planner, read_action_settings
+from rlftsim.envs.planners.registry import (
+    Planner,
+    PlannerFailure,
+    guard_planner,
+    hash_code,
+    load_planner,
+    read_action_settings,
+)
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
-from rlftsim.errors import ConfigError, DataError, whole_number
-from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
+from rlftsim.errors import ConfigError, in_short, whole_number
+from rlftsim.evaluation.drive_results import FAILED, FAILURES, DriveResult, DriveSettings, rank_scenarios
 from rlftsim.evaluation.resumable import (
     ScenarioValues,
     check_same_work,
@@ -32,10 +41,14 @@ from rlftsim.evaluation.resumable import (
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
 from rlftsim.viewer.film import to_film
+
+ROW_SCORES = (*SCORE_NAMES, "blamed_others_rate", "others_realism")
+"""Scores in the row of a scenario."""
+FILMS = re.compile(r"first|failures|worst:[1-9]\d{0,5}")
 
 
 @dataclass(frozen=True)
@@ -43,7 +56,7 @@ class DriveConfig:
     """A planner, the scenarios and the traffic."""
 
     planner: str
-    """Name of a planner, or package.module:Class."""
+    """Name of a planner, or package.module:Class, with options such as careful:Careful(headway=1.0) if any."""
     data: str = "synthetic"
     split: str | None = "validation"
     model: str = "demo-base"
@@ -58,6 +71,8 @@ class DriveConfig:
     """Only these, by id."""
     jobs: int = 1
     """Processes. Changes no result."""
+    film: str | None = None
+    """Scenarios to film, see `choose_films`. Changes no result."""
 
     def __post_init__(self) -> None:
         for name in ("num_rollouts", "jobs"):
@@ -72,6 +87,8 @@ class DriveConfig:
             raise ConfigError(f"traffic names one kind twice: {', '.join(self.traffic)}.")
         if len(set(self.scenarios or ())) < len(self.scenarios or ()):
             raise ConfigError(f"scenarios names one twice: {', '.join(self.scenarios or ())}.")
+        if self.film is not None and not FILMS.fullmatch(self.film):
+            raise ConfigError(f"film must be first, failures, or worst:N such as worst:5, got {in_short(self.film)}.")
 
     def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for a kind of traffic: no event ends an episode, and no reward is given."""
@@ -113,7 +130,8 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     ]
     # processes hand their rows over in files, so even results that are not kept need a folder
     with tempfile.TemporaryDirectory() as nowhere:
-        name = config.planner.replace(":", ".")
+        # options such as Careful(gap='wide/far') may have signs that names of files cannot have
+        name = re.sub(r"[^\w.()=,+-]+", "", config.planner.replace(":", "."))
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
         for settings, path in zip(drive_settings, paths):
             _read_and_refuse(config, settings, ids, path)
@@ -131,19 +149,13 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
         rollout: Number of the rollout, 0 or more; each with dice of its own.
 
     Raises:
-        DataError: the planner calls exit(). Any other error of the planner passes unchanged.
+        PlannerFailure: The planner raises an error, calls exit(), or wants what its type of action does not allow.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    try:
+    with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
         planner.reset(info)
         while not env.state.ended[0]:
             observation, *_ = env.step(planner.act(observation))
-    except SystemExit as stop:
-        # It would end the command, with exit() even as if all were done.
-        raise DataError(
-            f"planner {type(planner).__name__} calls exit({stop.code!r}) in scenario {scenario.scenario_id}: let it "
-            "raise an error, or choose other scenarios."
-        ) from stop
     return env.result()
 
 
@@ -232,7 +244,7 @@ def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[
     row, missing = values["row"], values["missing"]
     if row["scenario_id"] != scenario_id or not all(isinstance(reason, str) for reason in missing.values()):
         raise ValueError("of another scenario, or without a reason")
-    numbers = {name: float(row[name]) for name in (*SCORE_NAMES, "blamed_others_rate", "others_realism")}
+    numbers = {name: float(row[name]) for name in ROW_SCORES}
     return {"scenario_id": scenario_id, "traffic": values["settings"]["traffic"], **numbers}, missing
 
 
@@ -240,9 +252,12 @@ def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], posit
     """Row of a scenario, and the scores that the scenario cannot give."""
     env, planner = _environment(config, traffic), load_planner(config.planner)
     scenario = env.source.scenario(ids[position])
-    results = [
-        run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in range(config.num_rollouts)
-    ]
+    rollouts = range(config.num_rollouts)
+    try:
+        results = [run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in rollouts]
+    except PlannerFailure as failure:  # of one rollout counts for the scenario
+        row = {"scenario_id": ids[position], "traffic": traffic, **dict.fromkeys(ROW_SCORES, math.nan)}
+        return {"row": row, "missing": {FAILED: str(failure)}}
     rows = [result.scores for result in results]
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
@@ -259,19 +274,39 @@ def _environment(config: DriveConfig, traffic: str) -> EgoEnv:
     return EgoEnv(source=Source(config.settings(traffic)))
 
 
-def film(config: DriveConfig, out: Path) -> Path:
-    """Write a film of the first scenario, the kinds of traffic side by side; returns the path.
+def choose_films(results: Sequence[DriveResult], choice: str) -> list[str]:
+    """Ids of the scenarios to film, the worst first; none in which the planner failed.
 
     Args:
-        config: Planner, data, kinds of traffic and number of rollouts.
+        results: Results of a planner in all types of traffic.
+        choice: "first"; "worst:N" for the N lowest scores `nuplan_style` in any traffic; "failures" for scenarios in
+            which the planner is at fault for a collision or leaves the road.
+    """
+    failed = {scenario_id for result in results for scenario_id in result.failures}
+    if choice == "first":
+        return [scenario_id for scenario_id in results[0].scenario_ids if scenario_id not in failed][:1]
+    worst = [scenario for scenario in rank_scenarios(results) if scenario.scenario_id not in failed]
+    if choice == "failures":
+        return [scenario.scenario_id for scenario in worst if {*scenario.causes} & {*FAILURES}]
+    return [scenario.scenario_id for scenario in worst[: int(choice.partition(":")[2])]]
+
+
+def film(config: DriveConfig, scenario_id: str, out: Path) -> Path:
+    """Write a film of a scenario, the types of traffic side by side; returns the path.
+
+    Args:
+        config: Planner, data, types of traffic and number of rollouts.
+        scenario_id: Scenario of the data set.
         out: Folder for the film SCENARIO.webp.
+
+    Raises:
+        PlannerFailure: The planner fails in this scenario.
     """
     records = {}
     for traffic in config.traffic:
         env = _environment(config, traffic)
-        scenario = env.source.scenario((config.scenarios or env.source.scenario_ids)[0])
-        result = run_planner(env, load_planner(config.planner), scenario, seed=config.seed)
-        records[f"{config.planner} in {traffic}"] = result.record
-    path = out / f"{scenario.scenario_id}.webp"
+        planner, scenario = load_planner(config.planner), env.source.scenario(scenario_id)
+        records[f"{config.planner} in {traffic}"] = run_planner(env, planner, scenario, seed=config.seed).record
+    path = out / f"{scenario_id}.webp"
     to_film(path, build_animation(records), steps_per_frame=2, dots_per_inch=70)
     return path

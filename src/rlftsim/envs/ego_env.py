@@ -16,7 +16,7 @@ from rlftsim.envs.spaces import action_space, format_observation, observation_sp
 from rlftsim.envs.world import Noise, fork
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
-from rlftsim.scenario.any_form import AnyScenarios
+from rlftsim.scenario.open import AnyScenarios
 from rlftsim.viewer.film import Camera
 from rlftsim.viewer.page import Panel
 from rlftsim.viewer.scene import SceneMotion

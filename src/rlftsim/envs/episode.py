@@ -135,13 +135,17 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     )
 
 
-def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[EpisodeState, Outcome]:
+def advance(
+    episode: Episode, state: EpisodeState, action: Any, imposed: Float[np.ndarray, "M h 5"] | None = None
+) -> tuple[EpisodeState, Outcome]:
     """State and outcome after an action of every planner-driven agent.
 
     Args:
         episode: Episode with the constant world, map and settings.
         state: State before the action; not changed.
         action: Planner actions [M, *shape]; actions of agents whose episode is over are ignored.
+        imposed: Motion of some agents in place of their actions, at each step that an action lasts; NaN = the agent
+            acts.
 
     Raises:
         ConfigError: no numbers, a NaN, a wrong shape, or an action that an agent cannot take.
@@ -153,11 +157,12 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
     )
     action = validate_actions(action, episode.controls, episode.agent_name, episode.num_agents)
     moves = episode.controls.move(action, actors)
+    motions = moves.motion if imposed is None else np.where(np.isnan(imposed), moves.motion, imposed)
     terms = {}
     for step in range(episode.controls.steps):
         # an agent whose episode is over stands still
         stands = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], -1)
-        moved = np.where(state.ended[:, None], stands, moves.motion[:, step])
+        moved = np.where(state.ended[:, None], stands, motions[:, step])
         state, step_terms = _step(episode, state, moved)
         terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
     following = _with_ends(episode, state)

@@ -4,6 +4,7 @@ M agents with a line of W points each, a point every meter from the agent's cent
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,7 +14,7 @@ from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import compute_headings, sample_line
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.geometry import heights_overlap, wrapped
-from rlftsim.scenario.polylines import arc_length
+from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
 
 LOOKAHEAD_M = 40
@@ -27,7 +28,11 @@ PARKED_MPS = 0.5
 NEAREST, BEYOND_BOX_M = 16, 10.0
 """Leaders are searched among so many boxes, whose centers are no farther than this beyond the end of the search."""
 STANDS_M = 2.0
-"""A logged way shorter than this has no direction of its own."""
+"""An agent that never gets farther than this in its log has no direction of its own."""
+TURN_M = 0.25
+"""Ways that go back by less are noise."""
+CREEP_MPS = 0.001
+"""Speed that takes an agent past the point where it turns back; without it the point would never quite be reached."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,8 @@ class IdmLines:
     """Direction of the line."""
     facing: Float[np.ndarray, "M P"]
     """Heading of the agent there: against the line where it backs up in its log."""
+    turn_m: Float[np.ndarray, "M P"]
+    """Distance along the line to the next point where the agent stops to go the other way; infinite without one."""
     ground: Float[np.ndarray, "M P"]
     """Height of the ground; zeros in scenes without levels."""
     stop_m: Float[np.ndarray, "M T"]
@@ -137,19 +144,18 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
     """
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
-    logged_paths = [_logged_path(scene, int(agent)) for agent in agents]
-    lines = [sample_line(path[:, :2], 1.0) for path in logged_paths]
-    longest = max((len(line) for line in lines), default=1)
-    points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
-        np.zeros((1, 2))
-    ])[: len(agents)]  # fmt: skip
-    heading = np.stack([np.pad(compute_headings(line), (0, longest - len(line)), mode="edge") for line in lines] or [
-        np.zeros(1)
-    ])[: len(agents)]  # fmt: skip
-    backs_up = np.zeros(heading.shape, bool)
-    for row, path in enumerate(logged_paths):
-        at = np.minimum(np.searchsorted(arc_length(path), np.arange(longest), side="right"), len(path) - 1)
-        backs_up[row] = np.cos(heading[row] - path[at - 1, 2]) < 0
+    sampled = [_sample_path(_logged_path(scene, int(agent))) for agent in agents]
+    longest = max((len(line) for line, _ in sampled), default=1)
+    shape = (len(agents), longest)
+    points, heading, backs_up = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape, bool)
+    for row, (line, is_backward) in enumerate(sampled):
+        beyond = (0, longest - len(line))
+        points[row] = np.pad(line, (beyond, (0, 0)), mode="edge")
+        heading[row] = np.pad(compute_headings(line), beyond, mode="edge")
+        backs_up[row] = np.pad(is_backward, beyond, mode="edge")
+    turn_m = np.full(shape, np.inf)
+    turn_m[:, :-1][backs_up[:, 1:] != backs_up[:, :-1]] = 1.0
+    turn_m = np.minimum.accumulate((turn_m + np.arange(longest))[:, ::-1], axis=1)[:, ::-1]
     free_speed = np.where(backs_up.any(1), fastest, np.maximum(fastest, config.speed_mps))
     offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
     ground = np.zeros(heading.shape)
@@ -158,7 +164,7 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
         offset[~is_on_level(scene.lights.z - ground[..., None])] = np.inf
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
     facing = np.where(backs_up, wrapped(heading + np.pi), heading)
-    return IdmLines(agents, points, heading, facing, ground, stop, free_speed)
+    return IdmLines(agents, points, heading, facing, turn_m, ground, stop, free_speed)
 
 
 def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
@@ -167,13 +173,60 @@ def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
     step = np.linalg.norm(np.diff(logged[:, :2], axis=0), axis=1)
     poses = logged[np.append(True, step > 0.05), :3]
     direction = logged[0, 2] + (np.pi if signed_speed(logged[:1])[0] < 0 else 0.0)
-    if len(poses) > 1 and np.linalg.norm(poses[-1, :2] - poses[0, :2]) > STANDS_M:
+    if np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1).max() > STANDS_M:
         last = poses[-1] - poses[max(len(poses) - 5, 0)]
         direction = np.arctan2(last[1], last[0])
     else:
         poses = poses[:1]
     beyond = poses[-1] + BEYOND_M * np.array([np.cos(direction), np.sin(direction), 0.0])
     return np.vstack([poses, beyond])
+
+
+def _sample_path(path: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, "P"]]:
+    """Points a meter apart along a path, and where the agent backs up to the next one.
+
+    Points where it turns back are kept; before them the distances are whole parts of the length.
+    """
+    step, length = np.diff(path[:, :2], axis=0), arc_length(path)
+    is_backward = step[:, 0] * np.cos(path[:-1, 2]) + step[:, 1] * np.sin(path[:-1, 2]) < 0
+    turns = np.append(0, np.flatnonzero(np.diff(is_backward)) + 1)
+    turns = turns[np.diff(length[turns], append=length[-1]) >= TURN_M]
+    turns = turns[np.append(True, np.diff(is_backward[turns]))]
+    bounds = [0, *turns[1:].tolist()]
+    lines = [
+        resample_to(path[start : end + 1, :2], round(float(length[end] - length[start])) + 1)[:-1]
+        for start, end in pairwise(bounds)
+    ]
+    lines.append(sample_line(path[bounds[-1] :, :2], 1.0))
+    return np.concatenate(lines), np.repeat(is_backward[turns], [len(line) for line in lines])
+
+
+def _compute_turning_speed(
+    distance: Float[np.ndarray, "M"], speed: Float[np.ndarray, "M"], config: IdmConfig
+) -> Float[np.ndarray, "M"]:
+    """Largest speed after a step from which the usual braking ends in a standstill at the turn, m/s.
+
+    Args:
+        distance: Distance to the turn before the step, m.
+        speed: Speed before the step, m/s.
+        config: Parameters of the driver model.
+    """
+    braking, half_step = config.braking_mps2, STEP_S / 2
+    square = CREEP_MPS**2 + 2 * braking * (distance - speed * half_step) + (braking * half_step) ** 2
+    return np.maximum(np.sqrt(np.maximum(square, 0.0)) - braking * half_step, 0.0)
+
+
+def begin_idm(lines: IdmLines, scene: Scene) -> Float[np.ndarray, "M 2"]:
+    """Distance along the line, m, and speed, m/s, at the current step; an agent that rolls against its line stands.
+
+    Args:
+        lines: Lines of the IDM-driven agents, from the current poses on.
+        scene: Scene with the log of the agents.
+    """
+    velocity, angle = scene.logged[lines.agents, CURRENT_STEP, 3:], lines.heading[:, 0]
+    along = velocity[:, 0] * np.cos(angle) + velocity[:, 1] * np.sin(angle)
+    speed = np.where(along < 0, 0.0, np.linalg.norm(velocity, axis=-1))
+    return np.stack([np.zeros_like(speed), speed], -1)
 
 
 def advance_idm(
@@ -224,7 +277,9 @@ def advance_idm(
     lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)
     # 3. Along the line by the mean speed of the step.
     acceleration = compute_idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
-    new_speed = np.maximum(speed + acceleration * STEP_S, 0.0)
+    slowed = _compute_turning_speed(lines.turn_m[rows, position_m.astype(int)] - position_m, speed, config)
+    slowed = np.maximum(slowed, speed - config.hardest_braking_mps2 * STEP_S)
+    new_speed = np.clip(speed + acceleration * STEP_S, 0.0, slowed)
     position_m = np.minimum(position_m + (speed + new_speed) / 2 * STEP_S, lines.points.shape[1] - 1.001)
     low = position_m.astype(int)
     fraction = (position_m - low)[:, None]

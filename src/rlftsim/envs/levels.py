@@ -12,14 +12,15 @@ from scipy.spatial import KDTree
 
 from rlftsim.realism.map_based import HEIGHT_STRETCH
 
-CELL_M = 3.5
 LEVEL_M = 1.5
-"""Ground heights within a cell that differ by more than the height of a car are levels. The diagonal of a cell rises by
-as much on slopes of 30 %, where boxes that touch may differ in height by more than half the sum of their heights."""
+"""Ground heights that differ by more than the height of a car are levels, where roads as steep as `STEEPEST` do not
+explain it."""
+REACH_M, STEEPEST = 8.0, 0.3
+"""Centers of cars that touch are within this distance; on steeper roads the heights of such cars may be disjoint."""
 STEP_UP_M = 1.5
 """Largest step of the ground that an agent follows; beyond it the agent keeps its height."""
-GRADE = 0.15
-"""Height per meter that a slope beside a route may gain."""
+GRADE, FLAT_M = 0.15, 2.0
+"""Height per meter that a slope beside a route may gain, farther from it than its points are apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +64,13 @@ def build_levels(ground: Float[np.ndarray, "p 3"]) -> Levels | None:
     """
     if not len(ground) or np.ptp(ground[:, 2]) <= LEVEL_M:
         return None
-    # two points within half a cell of each other share a cell of one of four grids
-    for shift in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
-        column, row = np.floor(ground[:, :2] / CELL_M + shift).T
-        order = np.lexsort((row, column))
-        first = np.flatnonzero(np.append(True, (np.diff(column[order]) != 0) | (np.diff(row[order]) != 0)))
-        z = ground[order, 2]
-        if (np.maximum.reduceat(z, first) - np.minimum.reduceat(z, first)).max() > LEVEL_M:
-            return Levels(KDTree(ground * [1.0, 1.0, HEIGHT_STRETCH]))
+    # one point in each cube of a meter: parked agents stay, lanes lie side by side
+    _, first = np.unique(np.round(ground), axis=0, return_index=True)
+    points = ground[first]
+    pairs = KDTree(points[:, :2]).query_pairs(REACH_M, output_type="ndarray")
+    x, y, rise = (points[pairs[:, 0]] - points[pairs[:, 1]]).T
+    if np.any(np.abs(rise) > np.maximum(LEVEL_M, STEEPEST * np.hypot(x, y))):
+        return Levels(KDTree(ground * [1.0, 1.0, HEIGHT_STRETCH]))
     return None
 
 
@@ -120,7 +120,8 @@ class RouteHeights:
         """
         is_near_route = self.distance < distances
         rise = np.where(is_near_route, self.above_route - above_route[:, None], self.z - ground[:, None])
-        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, distances), 0.0)
+        beside = np.maximum(np.minimum(self.distance, distances) - FLAT_M, 0.0)
+        return np.maximum(np.abs(rise) - GRADE * beside, 0.0)
 
 
 def is_on_level(difference: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:

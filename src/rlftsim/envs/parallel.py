@@ -19,7 +19,7 @@ from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.rollout.policy import Policy
-from rlftsim.scenario.any_form import AnyScenarios
+from rlftsim.scenario.open import AnyScenarios
 
 Controlled = str | Sequence[int | str]
 

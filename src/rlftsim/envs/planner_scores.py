@@ -21,8 +21,7 @@ from rlftsim.envs.route import Route
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario, cached_on_scenario
 
 PROGRESS_M = 2.0
 """Least progress that counts as one: 2 m in nuPlan's code and configuration, 0.1 m in the text of its documents."""
@@ -342,12 +341,13 @@ def _comfort(record: Record) -> float:
 
 
 @cached_on_scenario
-def _signals(scenario: Scenario) -> Signals | None:
+def find_signals(scenario: Scenario) -> Signals | None:
+    """Traffic lights of a scenario, with the lanes that they are on; None without any."""
     return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
 
 
 def _red_light(record: Record) -> float:
-    signals = _signals(record.scene.scenario)
+    signals = find_signals(record.scene.scenario)
     if signals is None:
         return 0.0
     x, y = torch.from_numpy(record.agent_motion[:, :2] + record.scene.scenario.origin).float().T[:, None, None]

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from rlftsim.realism.map_based import RoadEdges, build_road_edges
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenario, cached_on_scenario
 
 OUTSIDE_M = 0.3
 """A corner this far off the road leaves the drivable area, as in nuPlan."""

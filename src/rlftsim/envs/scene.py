@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.levels import Levels, build_levels
-from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.lane_graph import LaneGraph, lane_graph
 from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import (
@@ -21,6 +20,7 @@ from rlftsim.scenario.types import (
     LightState,
     MapFeatureType,
     Scenario,
+    cached_on_scenario,
 )
 from rlftsim.viewer.scene import simplify
 

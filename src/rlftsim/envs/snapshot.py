@@ -6,6 +6,9 @@ episode again, which gives equal bits: the same network calls on the same number
 
 import hashlib
 import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import chain
 from typing import Any
@@ -19,12 +22,16 @@ from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, DataError, check_types, in_short
 from rlftsim.jobs.documents import parse_json
-from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S
 
 FORMAT = "rlftsim-snapshot-1"
 CHECKSUM_BYTES = 32
 IGNORED = ("data", "split", "model", "device", "render_mode", "observation", "frame")
 """Settings that may differ between writing and reading."""
+MAX_COORDINATE_M = 1e7
+"""Largest number of a motion, in meters, meters per second or radians."""
+SAME_M, JUMP_M = 1e-3, 0.5
+"""Difference from the log that another machine may make at the start, and way of a step beyond that of its speed."""
 
 
 def write_snapshot(episode: Episode, state: EpisodeState, fingerprint: str) -> bytes:
@@ -58,7 +65,7 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         source: Source of the environment that continues the episode.
 
     Raises:
-        DataError: no snapshot, or a damaged snapshot.
+        DataError: no snapshot, or a damaged snapshot, such as motion that does not begin as the log.
         ConfigError: A snapshot of a different model, or of other settings.
     """
     if not isinstance(saved, bytes) or hashlib.sha256(saved[:-CHECKSUM_BYTES]).digest() != saved[-CHECKSUM_BYTES:]:
@@ -68,31 +75,34 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         raise DataError("a snapshot of another version: take a new one with snapshot().")
     if about["model"] != source.fingerprint:
         raise ConfigError("the snapshot is of another traffic model: make the environment with the same one.")
-    goals: Any = {name: {int(i): p for i, p in points.items()} for name, points in (about["goals"] or {}).items()}
-    episode = source.episode([source.scenario(name) for name in about["scenarios"]], goals or None)
+    episode = source.episode([source.scenario(name) for name in about["scenarios"]], about["goals"] or None)
     differences = [name for name, value in _settings(episode).items() if about["settings"].get(name) != value]
     if differences:
         raise ConfigError(f"the snapshot was taken with another {differences[0]}: make the environment alike.")
     if motion.shape[1:] != (episode.num_agents, 5):
         raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
-    try:
-        dice = [tuple(Dice(**values) for values in row) for row in about["dice"]]
-        for draw in chain.from_iterable(dice):
-            check_types(draw)
-            if min(draw.seed, draw.rollout) < 0:
-                raise ConfigError(f"negative dice: {in_short([draw.seed, draw.rollout])}")
-    except (TypeError, ConfigError) as error:
-        raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
+    with _damage_named():
+        _check_motion(motion, episode)
+        dice = _parse_dice(about["dice"], len(motion) - 1, episode)
     return episode, repeat(episode, start(episode, dice[0]), motion[1:], dice)
 
 
+@contextmanager
+def _damage_named() -> Iterator[None]:
+    """Turn any error about a value of a snapshot into a line that says the snapshot is damaged."""
+    try:
+        yield
+    except (SafetensorError, KeyError, AttributeError, ValueError, TypeError) as error:  # a ConfigError is a ValueError
+        raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
+
+
 def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
-    """Description and motion [T + 1, M, 5] of a snapshot.
+    """Description, with goals by object id, and motion [T + 1, M, 5] of a snapshot.
 
     Raises:
         DataError: A value is missing, of the wrong type or not finite.
     """
-    try:
+    with _damage_named():
         arrays = load(body)
         about = parse_json(arrays["about"].tobytes(), "take one with snapshot()", source="description of a snapshot")
         motion = arrays["motion"]
@@ -101,12 +111,51 @@ def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
         goals = about["goals"] or {}
         if not all(isinstance(value, dict) for value in (goals, *goals.values())):
             bad_names.append("goals")
-        is_motion = motion.ndim == 3 and motion.dtype.kind == "f" and np.isfinite(motion).all()
-        if bad_names or not is_motion or not about["dice"]:
-            raise ValueError(f"its {bad_names[0] if bad_names else 'dice' if is_motion else 'motion'} cannot be used")
-    except (SafetensorError, KeyError, AttributeError, ValueError, TypeError) as error:
-        raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
+        if not (about["scenarios"] and all(isinstance(name, str) for name in about["scenarios"])):
+            bad_names.append("scenarios")
+        if motion.ndim != 3 or motion.dtype != np.float64 or not (np.abs(motion) <= MAX_COORDINATE_M).all():
+            bad_names.append("motion")
+        if bad_names:
+            raise ValueError(f"its {bad_names[0]} cannot be used")
+        about["goals"] = {name: {int(i): point for i, point in points.items()} for name, points in goals.items()}
     return about, motion
+
+
+def _check_motion(motion: np.ndarray, episode: Episode) -> None:
+    """Check that motion [T + 1, M, 5] begins as the log of the scenarios and goes on without a jump.
+
+    Raises:
+        ValueError: A wrong number of steps, another beginning, or a step farther than the speed explains.
+    """
+    if not 1 <= len(motion) <= FUTURE_STEPS + 1:
+        raise ValueError(f"its motion has {len(motion) - 1} steps, not 0 to {FUTURE_STEPS}")
+    scene, agent = episode.world.actors.T
+    if not np.allclose(motion[0], episode.world.logged[scene, agent, CURRENT_STEP], rtol=0.0, atol=SAME_M):
+        raise ValueError("its motion does not begin as the log of its scenario")
+    speed = np.linalg.norm(motion[..., 3:], axis=-1)  # [T + 1, M], m/s
+    distance = np.linalg.norm(np.diff(motion[..., :2], axis=0), axis=-1)  # [T, M], m
+    jumps = np.argwhere(distance > np.maximum(speed[1:], speed[:-1]) * STEP_S + JUMP_M)
+    if len(jumps):
+        step, row = jumps[0].tolist()
+        raise ValueError(f"{episode.agent_name(row)} jumps by {distance[step, row]:.3g} m at step {step + 1}")
+
+
+def _parse_dice(rows: list[Any], num_steps: int, episode: Episode) -> list[tuple[Dice, ...]]:
+    """Dice of each scene at the start and at each decision.
+
+    Raises:
+        ValueError, TypeError: Dice of other scenes or decisions, or no whole numbers of at least 0.
+    """
+    policy, num_scenes = episode.world.policy, len(episode.world.scenes)
+    num_rows = 1 if policy is None else 1 + math.ceil(num_steps / policy.steps_per_decision)
+    dice = [tuple(Dice(**values) for values in row) for row in rows]
+    if [len(row) for row in dice] != [num_scenes] * num_rows:
+        raise ValueError(f"its dice are not of {num_scenes} scenarios and {num_rows} decisions")
+    for draw in chain.from_iterable(dice):
+        check_types(draw)
+        if min(draw.seed, draw.rollout) < 0:
+            raise ValueError(f"negative dice: {in_short([draw.seed, draw.rollout])}")
+    return dice
 
 
 def _settings(episode: Episode) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
-from rlftsim.scenario.any_form import AnyScenarios, to_scenarios
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, Scenarios, list_scenario_ids
 
 KEPT_CONTEXTS = 16

@@ -21,7 +21,7 @@ from rlftsim.realism import METRIC_2025, MetricConfig, SimulatedStates, score
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import compute_distance_to_road_edge
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, ObjectType, Scenario
-from rlftsim.viewer.overlap import compute_overlap
+from rlftsim.viewer.scene import compute_overlap
 
 RISKY_TTC_S = 1.0
 INFEASIBLE_ACCELERATION_MPS2 = 8.0

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.envs.drivers import Driver, Rules, assign_drivers
-from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, build_idm_lines
+from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, begin_idm, build_idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
@@ -213,8 +213,7 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
         with one_thread(), torch.no_grad():
             block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
         noise = _decision_noise(world, dice)
-    speed = [np.linalg.norm(scene.logged[lines.agents, CURRENT_STEP, 3:], axis=-1) for scene, lines in _idm(world)]
-    idm_states = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
+    idm_states = tuple(begin_idm(lines, scene) for scene, lines in _idm(world))
     track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
     return WorldState(track, z, block, noise, (tuple(dice),), idm_states)

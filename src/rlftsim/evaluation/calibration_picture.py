@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from rlftsim.policies.calibrated.policy import CALIBRATION
-from rlftsim.policies.calibrated.table import read_calibration
+from rlftsim.policies.calibrated.policy import CALIBRATION, read_calibration
 from rlftsim.viewer.figure import Interval, draw_intervals, save_figure
 
 

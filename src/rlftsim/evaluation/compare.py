@@ -2,12 +2,12 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Shaped
+from rich import box
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
@@ -74,6 +74,25 @@ class PairedDifference:
             return f"difference: {numbers}."
         is_better = (self.difference > 0) == (direction == "higher")
         return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Both means, the difference, both ends of the interval, the p-value and the verdict in a word, for tables."""
+        means = [f"{mean:.4f}" if self.count else "–" for mean in (self.mean_a, self.mean_b)]
+        interval = ["–" if math.isnan(end) else f"{end:+.3f}" for end in self.interval]
+        difference = f"{self.difference:+.4f}" if self.count else "–"
+        p_value = "–" if math.isnan(self.p_value) or not self.standard_error else f"{self.p_value:.2g}"
+        return *means, difference, *interval, p_value, self._judge()
+
+    def _judge(self) -> str:
+        if self.count and self.standard_error == 0 and self.difference == 0:
+            return "equal"
+        if not self.is_difference:
+            return "unclear"
+        direction = find_direction(self.column)
+        if direction == "log":  # neither more nor less is better
+            return "differs"
+        return "better" if (self.difference > 0) == (direction == "higher") else "worse"
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,12 +265,25 @@ def _with_rmm(count: int, num_scenarios: int) -> str:
 
 
 def format_table(*evaluations: Evaluation) -> Table:
-    """A row per evaluation: mean ± standard error over the scenarios. Arrows point in the better direction.
+    """A column per evaluation: mean ± standard error over the scenarios. Arrows point in the better direction.
 
     Args:
-        evaluations: Evaluations in the order of the rows; `select_columns` chooses the columns.
+        evaluations: Evaluations in the order of the columns; `select_columns` chooses the rows.
     """
-    columns = select_columns(*evaluations)
+    table = Table(caption=describe_data(*evaluations) or None, caption_justify="left")
+    table.add_column("", no_wrap=True)
+    for evaluation in evaluations:
+        table.add_column(evaluation.name, justify="right", overflow="fold")
+    counts = [f"{len(evaluation)}{_with_rmm(evaluation.num_with_rmm, len(evaluation))}" for evaluation in evaluations]
+    table.add_row("scenarios", *counts)
+    for column in select_columns(*evaluations):
+        means = [evaluation.mean_and_error(column.source) for evaluation in evaluations]
+        table.add_row(column.fraction_label, *(_plus_minus(mean.mean, mean.standard_error) for mean in means))
+    return table
+
+
+def describe_data(*evaluations: Evaluation) -> str:
+    """Sentences on the data and the goals of evaluations; empty where there is nothing to say."""
     with_goals = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
     notes = list(dict.fromkeys(evaluation.data_note for evaluation in evaluations))
     if with_goals:
@@ -259,44 +291,45 @@ def format_table(*evaluations: Evaluation) -> Table:
             f"{', '.join(with_goals)}: the goals of evaluated agents were their logged final positions; an agent that "
             "never comes near its goal has missed it."
         )
-    table = Table(caption=" ".join(note for note in notes if note) or None, caption_justify="left")
-    table.add_column("policy", no_wrap=True)
-    table.add_column("scenarios", justify="right")
-    for column in columns:
-        table.add_column(column.fraction_label, justify="right")
-    for evaluation in evaluations:
-        means = [evaluation.mean_and_error(column.source) for column in columns]
-        cells = [_plus_minus(mean.mean, mean.standard_error) for mean in means]
-        num_scenarios = len(evaluation)
-        table.add_row(evaluation.name, f"{num_scenarios}{_with_rmm(evaluation.num_with_rmm, num_scenarios)}", *cells)
+    return " ".join(note for note in notes if note)
+
+
+def format_comparison(comparison: Comparison) -> Table:
+    """A row per column of the evaluations: both means, the difference with its interval, and the verdict."""
+    a, b = comparison.a, comparison.b
+    table = comparison_table(a.name, b.name, comparison.differences[0].alpha)
+    table.title = f"{b.name} against {a.name}: {comparison.pairing}"
+    table.caption = " ".join(filter(None, [comparison.caution, describe_data(a, b)])) or None
+    for column in select_columns(a, b):
+        table.add_row(column.fraction_label, *comparison[column.source].cells)
     return table
 
 
-def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TERMINAL_COLUMNS) -> Table:
-    """A row per column: both means, the difference ± standard error and the verdict.
+def comparison_table(name_a: str, name_b: str, alpha: float) -> Table:
+    """Empty table for `PairedDifference.cells` behind a label; 80 characters are enough for all of it.
 
     Args:
-        comparison: Paired comparison of two evaluations.
-        columns: Columns of evaluations, in the order of the rows.
+        name_a: Heading of the reference.
+        name_b: Heading of the result to judge.
+        alpha: Significance level of the intervals.
     """
     table = Table(
-        title=f"{comparison.b.name} against {comparison.a.name}: {comparison.pairing}",
+        box=box.SIMPLE,
+        padding=(0, 0, 0, 1),
+        collapse_padding=True,
+        show_edge=False,
+        pad_edge=False,
         title_justify="left",
-        caption=comparison.caution or None,
         caption_justify="left",
     )
     table.add_column("", no_wrap=True)
-    for name in (comparison.a.name, comparison.b.name, "difference"):
-        table.add_column(name, justify="right")
-    table.add_column("verdict")
-    for column in columns:
-        row = comparison[column.source]
-        difference = _plus_minus(row.difference, row.standard_error, sign="+")
-        table.add_row(column.fraction_label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", difference, row.verdict)
+    for name in (name_a, name_b, "change", f"{100 - 100 * alpha:g} %", "to", "p"):
+        table.add_column(name, justify="right", overflow="fold")
+    table.add_column("verdict", no_wrap=True)
     return table
 
 
-def _plus_minus(mean: float, error: float, sign: str = "") -> str:
+def _plus_minus(mean: float, error: float) -> str:
     if math.isnan(mean):  # no scenario has a value
         return "–"
-    return f"{mean:{sign}.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")
+    return f"{mean:.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")

@@ -13,10 +13,9 @@ from scipy.spatial import KDTree
 
 from rlftsim.geometry import boxes_overlap, wrapped
 from rlftsim.realism import SimulatedStates
-from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.polylines import densify
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, ObjectType, Scenario, cached_on_scenario
 
 MOVING_M_S = 1.0
 """An agent moves if its mean logged speed is at least this."""

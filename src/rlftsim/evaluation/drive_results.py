@@ -1,6 +1,7 @@
 """Results of `rlftsim drive`: a Parquet file with a row per scenario, for a planner in a type of traffic."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
@@ -14,7 +15,7 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
-from rlftsim.evaluation.compare import PairedDifference, compare_paired
+from rlftsim.evaluation.compare import PairedDifference, compare_paired, comparison_table
 from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import write_atomically
@@ -27,6 +28,18 @@ MAIN_SCORES = (
     "at_fault_collision_rate", "hit_rate", "others_realism", "others_collision_rate", "others_offroad_rate",
 )  # fmt: skip
 """Columns of the table and of comparisons on the command line; the file has more."""
+CAUSES = {
+    "no_at_fault_collision": "at fault for a collision", "drivable_area": "leaves the road",
+    "driving_direction": "drives against its lane", "making_progress": "hardly moves",
+    "time_to_collision": "gets too close", "progress": "is slow", "speed_limit": "is too fast",
+    "comfort": "jerks",
+}  # fmt: skip
+"""Part of the score `nuplan_style` -> what a planner does where it is low, the heaviest first."""
+FAILURES = (CAUSES["no_at_fault_collision"], CAUSES["drivable_area"])
+LOW = 0.5
+"""A part of the score below this is named as a cause."""
+FAILED = "all scores"
+"""Name under which `DriveResult.missing` has the error of a planner that failed."""
 TEXTS = ("scenario_id", "traffic")
 """Columns that are no scores."""
 
@@ -88,6 +101,11 @@ class DriveResult:
         return f"{self.settings.planner} in {self.settings.traffic}"
 
     @property
+    def failures(self) -> dict[str, str]:
+        """Scenario id -> error of the planner that failed there; all its scores are NaN."""
+        return {name: reasons[FAILED] for name, reasons in self.missing.items() if FAILED in reasons}
+
+    @property
     def scenario_ids(self) -> list[str]:
         """Ids of the scenarios, in the order of the rows."""
         return self.table["scenario_id"].to_pylist()
@@ -110,10 +128,8 @@ class DriveResult:
             DataError: Not such a file, or a file that was cut or edited.
         """
         way_out = "not a result of `rlftsim drive`, drive again"
-        try:
-            table = read_parquet(path, way_out)
-        except FileNotFoundError:
-            raise DataError(f"{path}: no such result of `rlftsim drive`: drive again.") from None
+        missing = f"{path}: no such result of `rlftsim drive`: drive again."
+        table = read_parquet(path, way_out, missing=missing)
         metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
         about = parse_json(metadata, way_out, source=str(path))
         try:
@@ -219,6 +235,46 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
     return DriveComparison(a, b, tuple(rows))
 
 
+@dataclass(frozen=True)
+class RankedScenario:
+    """A scenario with the lowest score of a planner in some types of traffic."""
+
+    scenario_id: str
+    score: float
+    """Lowest `nuplan_style`."""
+    traffic: str
+    """Type of traffic with this score."""
+    causes: tuple[str, ...]
+    """What the planner does there, of `CAUSES`."""
+
+
+def rank_scenarios(results: Sequence[DriveResult]) -> list[RankedScenario]:
+    """Scenarios by the lowest score of the planner in any traffic, the worst first; without those that have no score.
+
+    Args:
+        results: Results of a planner in types of traffic, on the same scenarios.
+    """
+    rows = [
+        (float(result.values("nuplan_style")[row]), scenario_id, result, row)
+        for result in results
+        for row, scenario_id in enumerate(result.scenario_ids)
+    ]
+    worst: dict[str, RankedScenario] = {}
+    for score, scenario_id, result, row in sorted(rows, key=lambda entry: entry[0]):
+        if scenario_id not in worst and not math.isnan(score):
+            causes = tuple(cause for name, cause in CAUSES.items() if result.values(name)[row] < LOW)
+            worst[scenario_id] = RankedScenario(scenario_id, score, result.settings.traffic, causes)
+    return list(worst.values())
+
+
+def format_worst(scenarios: Sequence[RankedScenario]) -> Table:
+    """A row per scenario: score, traffic and what the planner does there."""
+    table = Table("worst scenarios", "nuplan_style", "traffic", "the planner")
+    for scenario in scenarios:
+        table.add_row(scenario.scenario_id, f"{scenario.score:.4f}", scenario.traffic, ", ".join(scenario.causes))
+    return table
+
+
 def format_drives(*results: DriveResult) -> Table:
     """A column per result: mean ± standard error over the scenarios."""
     table = Table()
@@ -232,22 +288,22 @@ def format_drives(*results: DriveResult) -> Table:
             + (f" ± {format_number(mean.standard_error, 4)}" if mean.count > 1 else "")
             for mean in means
         ]  # fmt: skip
-        table.add_row(f"{name} {ARROWS[find_direction(name)]}", *cells)
+        table.add_row(f"{name}{ARROWS[find_direction(name)]}", *cells)
     return table
 
 
 def format_drive_comparison(comparison: DriveComparison) -> Table:
-    """A row per score: both means and the verdict."""
+    """A row per score: both means, the difference with its interval, and the verdict."""
     a, b = comparison.a, comparison.b
     models = {a.settings.model, b.settings.model} - {"none"}
     note = ", whose traffic models differ" if len(models) > 1 else ""
-    table = Table(title=f"{b.name} against {a.name}{note}", title_justify="left")
-    table.add_column("", no_wrap=True)
-    for name in (a.name, b.name):
-        table.add_column(name, justify="right")
-    table.add_column("verdict")
+    parts_a, parts_b = (a.settings.planner, a.settings.traffic), (b.settings.planner, b.settings.traffic)
+    # headings say what differs
+    differing = [names for names in zip(parts_a, parts_b) if names[0] != names[1]]
+    headings = differing[0] if len(differing) == 1 else (a.name, b.name)
+    table = comparison_table(*headings, max((row.alpha for row in comparison), default=0.05))
+    table.title = f"{b.name} against {a.name}{note}: {max(row.count for row in comparison)} scenarios in both"
     for row in comparison:
         if row.column in MAIN_SCORES and row.count:
-            label = f"{row.column} {ARROWS[find_direction(row.column)]}"
-            table.add_row(label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", row.verdict)
+            table.add_row(row.column, *row.cells)
     return table

@@ -19,8 +19,7 @@ from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
-from rlftsim.goals.logged import logged_goals
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, logged_goals
 from rlftsim.jobs.buckets import validate_folder
 from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score

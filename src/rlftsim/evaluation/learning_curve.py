@@ -6,7 +6,7 @@ from typing import Any
 
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.viewer.chart import Chart, Curve
-from rlftsim.viewer.chart_picture import charts_to_png
+from rlftsim.viewer.figure import charts_to_png
 
 Lines = Sequence[Mapping[str, Any]]
 """Values of each update, see `read_metrics`."""

@@ -23,8 +23,8 @@ from rlftsim.jobs.documents import describe_type, parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
+from rlftsim.realism.config import LIGHT
 from rlftsim.realism.miss import compute_miss_rates
-from rlftsim.realism.official_names import LIGHT
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.sources import guessed_note
 from rlftsim.scenario.types import Scenario
@@ -266,10 +266,8 @@ class Evaluation:
             files = sorted(file.name for file in Path(path).glob("*.parquet") if file.is_file())
             hint = f"name one of {', '.join(files)}" if files else "name a Parquet file of `rlftsim evaluate`"
             raise DataError(f"{path} is a folder: {hint}.")
-        try:
-            table = read_parquet(path, "evaluate again")
-        except FileNotFoundError:
-            raise DataError(f"{path}: no such evaluation: make one with `rlftsim evaluate`.") from None
+        missing = f"{path}: no such evaluation: make one with `rlftsim evaluate`."
+        table = read_parquet(path, "evaluate again", missing=missing)
         # our part of the file's metadata; pandas and others may add theirs
         metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
         about = parse_json(metadata, "evaluate again", source=str(path))

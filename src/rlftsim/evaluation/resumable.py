@@ -21,7 +21,7 @@ import pyarrow as pa
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import remove_folder, remove_temporaries, write_text
+from rlftsim.jobs.files import check_result_file, remove_folder, remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
 from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.progress import log
@@ -68,6 +68,7 @@ class ScenarioValues(ScenarioFormat[Stored, Mapping[str, object]]):
     def read(self, item: range) -> Stored | None:
         """The parsed values of a scenario, see `ResultFormat`."""
         scenario_id = self.scenario_ids[item.start]
+        check_result_file(self.folder / f"{scenario_id}.json")
         try:
             values = self._read(scenario_id)
             return self.parse(scenario_id, values) if self._agrees(scenario_id, values) else None
@@ -82,6 +83,7 @@ class ScenarioValues(ScenarioFormat[Stored, Mapping[str, object]]):
         """True if there are files of other scenarios or settings, see `ScenarioFormat`."""
         for name in (path.stem for path in self.folder.glob("*.json")):
             with suppress(DataError, FileNotFoundError):  # a damaged file holds nothing
+                check_result_file(self.folder / f"{name}.json")
                 if name not in scenario_ids or not self._agrees(name, self._read(name)):
                     return True
         return False
@@ -107,8 +109,7 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         check_name(self.name, "an evaluation's name")
         if self.out.suffix == ".parquet":
             raise ConfigError(f"{self.out} is to be a folder, in which {self.name}.parquet is written: name a folder.")
-        if self.result_path.is_dir():
-            raise ConfigError(f"{self.result_path} is a folder: pass another name for the evaluation, or remove it.")
+        check_result_file(self.result_path)
 
     @property
     def result_path(self) -> Path:
@@ -314,7 +315,7 @@ def finish_result(
                     title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress
                 )
                 result = combine(stored)
-                remove_temporaries(path)
+                remove_temporaries([path])
                 result.write(path)
             # Only now: an interruption between the two leaves the groups, and the next call finds the result.
             _remove_groups(format, scenario_ids, runner)
@@ -387,8 +388,9 @@ def read_finished(path: Path, read: Callable[[Path], FinishedResult]) -> Finishe
         read: Reader of the file; raises a DataError that ends in a way out.
 
     Raises:
-        DataError: A file that is no such result, or damaged, and that may be a user's, so it stays.
+        DataError: A file that is no such result, or damaged, and that may be a user's, so it stays; or no file.
     """
+    check_result_file(path)
     try:
         return read(path) if path.exists() else None
     except DataError as error:

@@ -19,6 +19,7 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.wire_format import BYTES, MAX_FIELD_BYTES, WireField, iterate_fields
 from rlftsim.jobs.arrays import read_npz
+from rlftsim.jobs.documents import check_has_end
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import FUTURE_STEPS
 
@@ -113,6 +114,7 @@ def _pickle_error(path: Path) -> DataError:
 
 def _list_entries(path: Path) -> list[RolloutEntry]:
     try:
+        check_has_end(path)
         with path.open("rb") as file:
             magic = file.read(4)
     except OSError as error:

@@ -14,16 +14,16 @@ from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.goals.goals_file import GoalsFile
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner
 from rlftsim.realism import SimulatedStates
-from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 
@@ -84,7 +84,7 @@ def simulate_folder(
         _check_identity(out, identity, is_alone=lease.is_alone)  # another share may have begun at the same moment
         task = partial(_simulate_scenario, simulation, out)
         paths = run_items("simulate", scenario_ids, task, format=rollouts, lease=lease, runner=runner)
-        remove_temporaries_below(out)  # of processes that were killed
+        remove_temporaries([out / ABOUT, *paths])  # of processes that were killed
         lease.remove()
     return paths
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.wire_format import BYTES, iterate_fields
-from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, dataset_folder
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, read_records
 from rlftsim.scenario.types import TOTAL_STEPS, Scenario

@@ -26,8 +26,8 @@ from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
+from rlftsim.realism.config import is_reported, official_buckets, official_fields
 from rlftsim.realism.map_based import select_polylines
-from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
 
 _NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"

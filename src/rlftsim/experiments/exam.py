@@ -30,8 +30,7 @@ from rlftsim.experiments.rows import RMM, Row
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy
-from rlftsim.scenario.dataset import SYNTHETIC, ScenarioDataset
-from rlftsim.scenario.splits import EXAM, TUNE
+from rlftsim.scenario.dataset import EXAM, SYNTHETIC, TUNE, ScenarioDataset
 from rlftsim.scenario.synthetic.generate import generate
 from rlftsim.statistics import MeanInterval, prediction_interval
 from rlftsim.training.run_folder import stored_settings

@@ -7,13 +7,11 @@ import torch
 from jaxtyping import Float
 
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.goals.maneuvers.logged import logged_maneuver
-from rlftsim.goals.maneuvers.proposals import Proposal, RoadTest, propose_from_lanes
+from rlftsim.goals.maneuvers.proposals import Proposal, RoadTest, logged_maneuver, propose_from_lanes
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge
-from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenario, cached_on_scenario
 
 MAX_PAIRS = 1 << 17
 LOGGED = " (logged)"

@@ -71,10 +71,8 @@ def read_goals(path: Path) -> GoalsFile:
     Raises:
         DataError: The file is missing or not JSON, or an entry is wrong; the message names file, entry and field.
     """
-    try:
-        return _parse_goals(read_json(path, _WAY_OUT, expected=object, allow_nan=True), str(path))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
+    missing = f"{path}: no such goals file: make one with `rlftsim goals propose`."
+    return _parse_goals(read_json(path, _WAY_OUT, expected=object, allow_nan=True, missing=missing), str(path))
 
 
 def parse_goals(text: str, path: str) -> GoalsFile:

@@ -1,7 +1,10 @@
-"""Goals: points that agents are conditioned on."""
+"""Goals: points that agents are conditioned on, such as the last logged position of each agent.
+
+Source: RLFTSim, section 4.2.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -12,7 +15,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenario
 
 Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
 """Distinct object ids, and a point for each. Frame: world, m, float64."""
@@ -62,9 +65,7 @@ class Goals:
             DataError: An agent that the scenario lacks or does not simulate, or a point that is not two finite numbers.
         """
         ids = [scenario.scenario_id for scenario in batch.scenarios]
-        by_scenario: dict[str, PointById] = {
-            str(key): value for key, value in points.items() if isinstance(value, Mapping)
-        }
+        by_scenario: dict[str, PointById] = {str(k): v for k, v in points.items() if isinstance(v, Mapping)}
         if len(by_scenario) != len(points):
             if len(ids) != 1 or by_scenario:
                 raise ConfigError(
@@ -99,7 +100,7 @@ class Goals:
 
     def rollouts(self, selected: slice) -> "Goals":
         """The goals of the selected rollouts."""
-        return replace(self, position=self.position[:, selected], goal_mask=self.goal_mask[:, selected])
+        return self._apply(lambda values: values[:, selected])
 
     def repeat(self, num_rollouts: int) -> "Goals":
         """The goals of a single rollout expanded to N, without copies; goals of N rollouts unchanged.
@@ -112,11 +113,7 @@ class Goals:
                 f"goals of {self.num_rollouts} rollouts do not fit {num_rollouts} rollouts: give goals of one rollout "
                 "or of as many."
             )
-        return replace(
-            self,
-            position=self.position.expand(-1, num_rollouts, -1, -1),
-            goal_mask=self.goal_mask.expand(-1, num_rollouts, -1),
-        )
+        return self._apply(lambda values: values.expand(-1, num_rollouts, *values.shape[2:]))
 
     def only(self, mask: Bool[Tensor, "B #N A"]) -> "Goals":
         """The same goals for the masked agents alone; the goals of all other agents are dropped."""
@@ -137,7 +134,10 @@ class Goals:
 
     def to(self, device: torch.device | str) -> "Goals":
         """The same goals on a device."""
-        return replace(self, position=self.position.to(device), goal_mask=self.goal_mask.to(device))
+        return self._apply(lambda values: values.to(device))
+
+    def _apply(self, function: Callable[[Tensor], Tensor]) -> "Goals":
+        return replace(self, position=function(self.position), goal_mask=function(self.goal_mask))
 
     def __repr__(self) -> str:
         num_scenarios, num_rollouts, num_agents = self.goal_mask.shape
@@ -216,3 +216,45 @@ def _check_point(point: object, location: str) -> None:
 
 def _join_ids(ids: list[str] | list[int]) -> str:
     return ", ".join(str(i) for i in ids[:MAX_LISTED_IDS]) + (", ..." if len(ids) > MAX_LISTED_IDS else "")
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedEndpoints:
+    """Each agent's last logged future state, undefined where `mask` is False. Frame: that of the batch."""
+
+    position: Float[Tensor, "B A 2"]
+    heading: Float[Tensor, "B A"]
+    horizon_s: Float[Tensor, "B A"]
+    """Time from the current step to the endpoint."""
+    mask: Bool[Tensor, "B A"]
+    """True = a simulated agent that is logged at some future step."""
+
+
+def logged_endpoints(batch: ScenarioBatch) -> LoggedEndpoints:
+    """Last logged states of the agents of a batch; without logged futures `mask` is False everywhere."""
+    valid = batch.valid[:, :, CURRENT_STEP : CURRENT_STEP + 1 + FUTURE_STEPS]  # [B, A, 81] or shorter
+    # [B, A], steps after the current one; 0 = never logged in the future
+    num_steps = (valid * torch.arange(valid.shape[2], device=valid.device)).amax(-1)
+    step = CURRENT_STEP + num_steps
+    return LoggedEndpoints(
+        position=_select_step(batch.position, step),
+        heading=_select_step(batch.heading[..., None], step)[..., 0],
+        horizon_s=num_steps * STEP_S,
+        mask=batch.agent_mask & (num_steps > 0),
+    )
+
+
+def logged_goals(batch: ScenarioBatch, agent_mask: Bool[Tensor, "B A"] | None = None) -> Goals:
+    """Each agent's last logged position as a goal, for a single rollout (`Goals.repeat` expands the goals to N).
+
+    Args:
+        batch: Scenarios with logged futures; agents without a future get no goal.
+        agent_mask: True = the agent gets a goal; None = every agent with a logged future does.
+    """
+    ends = logged_endpoints(batch)
+    return Goals.of_scenarios(ends.position, ends.mask if agent_mask is None else ends.mask & agent_mask, batch.frame)
+
+
+def _select_step(values: Float[Tensor, "B A S k"], step: Int64[Tensor, "B A"]) -> Float[Tensor, "B A k"]:
+    index = step[..., None, None].expand(-1, -1, 1, values.shape[-1])  # [B, A, 1, k]
+    return values.gather(2, index)[:, :, 0]

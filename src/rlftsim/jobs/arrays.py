@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.errors import DataError, RlftsimError
-from rlftsim.jobs.documents import first_line
+from rlftsim.jobs.documents import check_has_end, first_line
 
 MAX_ARRAY_BYTES = 1 << 30
 """Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
@@ -44,6 +44,7 @@ def read_tensors(
         RlftsimError: Damaged file.
     """
     try:
+        check_has_end(path)
         with safe_open(path, framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
@@ -69,6 +70,7 @@ def read_npz(
             `MAX_ARRAY_BYTES`.
     """
     try:
+        check_has_end(path)
         # numpy and Python warn of odd headers
         with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(path) as archive:
             members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}

@@ -20,7 +20,6 @@ from rlftsim.jobs.files import (
     NO_ROOM,
     errors_name,
     remove_temporaries,
-    remove_temporaries_below,
     temporary_path,
     write_atomically,
     write_text,
@@ -251,7 +250,7 @@ def fetch_shard(url: str, sha256: str) -> Path:
         if path.exists():
             os.utime(path)  # used now
         else:
-            remove_temporaries(path)  # of a process that was killed at this very shard
+            remove_temporaries([path])  # of a process that was killed at this very shard
             fetch(url, path, sha256)
             _evict(path)
     return path
@@ -307,8 +306,8 @@ def mirror(url: str, names: tuple[str, ...]) -> Path:
     """
     folder, url = local_copy(url, "data"), url.rstrip("/")
     with _locked(folder / ".lock"):
-        remove_temporaries_below(folder)
         new = folder / f"{names[-1]}.new"
+        remove_temporaries([new, *(folder / name for name in (*names, ORIGIN))])
         fetch(f"{url}/{names[-1]}", new)
         old = folder / names[-1]
         if not old.exists() or old.read_bytes() != new.read_bytes():

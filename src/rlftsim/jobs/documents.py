@@ -9,7 +9,9 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable
-from os import PathLike, fstat
+from errno import ESPIPE
+from os import PathLike, fspath, fstat, stat
+from stat import S_ISFIFO, S_ISSOCK
 from typing import Any
 
 from rlftsim.errors import DataError, RlftsimError, printable
@@ -37,6 +39,7 @@ def read_json(
     expected: type = dict,
     allow_nan: bool = False,
     error: type[RlftsimError] = DataError,
+    missing: str = "",
 ) -> Any:
     """Value of a JSON file in UTF-8, with or without a mark in front.
 
@@ -46,12 +49,13 @@ def read_json(
         expected: Type of the outermost value; `object` takes all.
         allow_nan: True takes NaN and infinities, too, which are no JSON.
         error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
-        FileNotFoundError: No such file; the caller names the file in the message.
+        FileNotFoundError: No such file, and no message for that.
         RlftsimError: The file cannot be read, or `parse_json` refuses the text.
     """
-    text = _read_bytes(path, MAX_TEXT_BYTES, remedy, error)
+    text = _read_bytes(path, MAX_TEXT_BYTES, remedy, error, missing)
     return parse_json(text, remedy, source=str(path), expected=expected, allow_nan=allow_nan, error=error)
 
 
@@ -148,12 +152,28 @@ def first_line(problem: BaseException) -> str:
     return printable(line)
 
 
-def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError]) -> bytes:
+def check_has_end(path: str | PathLike[str]) -> None:
+    """Check that a path is no pipe, whose reader may wait for ever; those that a shell makes, `<(...)`, have an end.
+
+    Raises:
+        OSError: No file, or a named pipe or socket.
+    """
+    mode = stat(path).st_mode
+    if (S_ISFIFO(mode) or S_ISSOCK(mode)) and not fspath(path).startswith("/dev/"):
+        raise OSError(ESPIPE, "a pipe, not a file")
+
+
+def _read_bytes(
+    path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError], missing: str = ""
+) -> bytes:
     try:
+        check_has_end(path)
         with open(path, "rb") as file:
             # a device or a pipe has no size, so the bytes that come are counted, too
             text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None
     except FileNotFoundError:
+        if missing:
+            raise error(missing) from None
         raise
     except (OSError, ValueError) as problem:  # the latter: a null byte in the name
         raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None

@@ -7,9 +7,9 @@ import re
 import shutil
 import socket
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from glob import escape
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -21,8 +21,8 @@ from rlftsim.jobs.documents import parse_json
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the operating system where a file does not fit."""
-_TEMPORARY = re.compile(r"\..+\..+\.\d+\.tmp")
-"""Names that `temporary_path` gives."""
+_TEMPORARY = re.compile(r"\.(.+)\.(\d+)\.tmp")
+"""Names that `temporary_path` gives: of file and machine, and the number of the process."""
 _ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
 """Where safetensors writes the number of an error of the operating system."""
 
@@ -96,26 +96,59 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
                 temporary.unlink()
 
 
+def check_result_file(path: Path) -> None:
+    """Check that a path at which a result is read or written is a file, if anything: a pipe would wait for ever.
+
+    Args:
+        path: File of a result; may be missing.
+
+    Raises:
+        DataError: A folder, a pipe or a device.
+    """
+    if path.exists() and not path.is_file():
+        meaning = "a folder" if path.is_dir() else "a pipe or device"
+        raise DataError(f"{path} is {meaning}, not a file: choose another --out or name, or remove it.")
+
+
 def temporary_path(path: Path) -> Path:
     """Name for a file that is not whole yet: unique to this process, on all machines that see the folder."""
     # Beside the file, as a rename is atomic within a file system only.
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
 
 
-def remove_temporaries(path: Path) -> None:
-    """Remove temporary files that killed writers left beside a file. No process may be writing the file now."""
-    for leftover in path.parent.glob(f".{escape(path.name)}.*.tmp"):
-        leftover.unlink(missing_ok=True)
+def remove_temporaries(paths: Iterable[Path]) -> None:
+    """Remove temporary files that ended processes left beside files; those of other files stay.
+
+    Args:
+        paths: Files that no other machine is writing now; processes of this machine are asked for.
+    """
+    names: dict[Path, set[str]] = defaultdict(set)
+    for path in paths:
+        names[path.parent].add(path.name)
+    for folder, outputs in names.items():
+        for leftover in folder.glob(".*.tmp"):
+            if (match := _TEMPORARY.fullmatch(leftover.name)) and _is_left(match[1], int(match[2]), outputs):
+                leftover.unlink(missing_ok=True)
 
 
-def remove_temporaries_below(folder: Path) -> None:
-    """Remove temporary files of killed writers below a folder, and no other files. No process may be writing there."""
-    for path in folder.rglob(".*.tmp"):
-        if _TEMPORARY.fullmatch(path.name):
-            path.unlink(missing_ok=True)
+def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:
+    """True for a temporary file of one of the names whose writer has ended, or is on another machine."""
+    name = name_and_host.removesuffix(f".{socket.gethostname()}")
+    if name == name_and_host:  # of another machine, whose name may have dots as the file's may
+        words = name.split(".")
+        return any(".".join(words[:number]) in names for number in range(1, len(words)))
+    if name in names and process != os.getpid() and os.name == "posix":  # elsewhere the question ends the process
+        try:
+            os.kill(process, 0)
+        except (ProcessLookupError, OverflowError):
+            return True
+        except PermissionError:
+            pass
+        return False
+    return name in names
 
 
-def remove_folder(folder: Path, names: Iterable[str]) -> None:
+def remove_folder(folder: Path, names: Collection[str]) -> None:
     """Remove files of the given names and the temporary files of killed writers, then the folder if empty.
 
     Args:
@@ -124,7 +157,7 @@ def remove_folder(folder: Path, names: Iterable[str]) -> None:
     """
     for name in names:
         (folder / name).unlink(missing_ok=True)
-        remove_temporaries(folder / name)
+    remove_temporaries(folder / name for name in names)
     with suppress(OSError):  # it holds something else, or is gone
         folder.rmdir()
 

@@ -21,7 +21,7 @@ from typing import Any, Literal, TextIO
 
 from rlftsim.errors import ConfigError, DataError, NotYetError, in_short
 from rlftsim.jobs.documents import MAX_NAME_BYTES, read_json
-from rlftsim.jobs.files import errors_name, write_text
+from rlftsim.jobs.files import check_result_file, errors_name, write_text
 from rlftsim.jobs.runner import Runner, Share, Unfinished, check_begun
 
 FolderType = Literal["data set", "submission", "set of rollouts", "model", "run", "results"]
@@ -131,8 +131,9 @@ def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> li
         remedy: Way out at the end of the message about a damaged file.
 
     Raises:
-        DataError: The file is damaged.
+        DataError: The file is damaged, or no file.
     """
+    check_result_file(path)
     stored = read_json(path, remedy) if path.exists() else identity
     return [name for name in {**identity, **stored} if stored.get(name) != identity.get(name)]
 
@@ -244,6 +245,7 @@ class Lease:
             Unfinished: A second process had a lock and has removed the file, at the end of all work.
             DataError: The file is no lock.
         """
+        check_result_file(path)
         with errors_name(path):
             if not must_exist:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -300,7 +302,7 @@ class Lease:
 
 def remove_locks(path: Path) -> None:
     """Remove the lock files of finished work and of its shares; missing and other files are no error."""
-    for lock in (*path.parent.glob(f"{path.name}.*-of-*"), path):
+    for lock in filter(Path.is_file, (*path.parent.glob(f"{path.name}.*-of-*"), path)):
         with suppress(FileNotFoundError), lock.open(encoding="utf-8", errors="replace") as file:
             stored = _read_lock(file)
             if not stored or _OWNER.search(stored):

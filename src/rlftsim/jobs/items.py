@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import check_result_file
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.processes import Advance, Task
 from rlftsim.jobs.progress import log, progress_bar
@@ -50,7 +51,11 @@ def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
     Args:
         path: File of the result, which may be missing.
         read: Reader of the file; raises a DataError for a damaged file.
+
+    Raises:
+        DataError: No file but a folder, a pipe or a device.
     """
+    check_result_file(path)
     if not path.exists():
         return None
     try:

@@ -3,6 +3,7 @@ tables."""
 
 import logging
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -21,11 +22,11 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from rlftsim.errors import printable
+from rlftsim.errors import printable, shorten
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200
-"""Width of a table that is not printed on a terminal, in characters."""
+"""Width of a table that is not printed on a terminal, in characters, unless the variable COLUMNS says another one."""
 
 
 class _StandardError(logging.StreamHandler):  # type: ignore[type-arg]
@@ -35,6 +36,9 @@ class _StandardError(logging.StreamHandler):  # type: ignore[type-arg]
         # The stream of the moment: the one at import may be closed by now.
         self.stream = sys.stderr
         super().emit(record)
+
+    def format(self, record: logging.LogRecord) -> str:
+        return _printable_lines(super().format(record))
 
 
 log = logging.getLogger("rlftsim")
@@ -50,12 +54,28 @@ class _PlainConsole(Console):
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Text without control characters; lines stay lines."""
-        return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
+        return super().render_str(_printable_lines(text), **options)
+
+
+def _printable_lines(text: str) -> str:
+    """A text without control characters; lines stay lines."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def print_line(text: object, file: Any = None) -> None:
+    """Print a line without control characters, and without the middle of a long one: users' files hold any name.
+
+    Args:
+        text: Line, or an object that is shown by its text; a line break in it becomes a space.
+        file: Stream of text; None = standard output.
+    """
+    print(shorten(str(text)), file=file)
 
 
 def print_wide(*tables: object) -> None:
-    """Print tables as wide as the terminal, or `FILE_WIDTH` wide in files. Brackets in texts are not markup."""
-    width = None if Console().is_terminal else FILE_WIDTH
+    """Print tables as wide as the terminal or as COLUMNS says, else `FILE_WIDTH` wide in files. Brackets in texts are
+    not markup."""
+    width = None if Console().is_terminal or "COLUMNS" in os.environ else FILE_WIDTH
     console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
         console.print(table)
@@ -124,6 +144,6 @@ def _lines(title: str, total: int, done: int, show: bool) -> Advance:
                 left = (moment - start) / (num_done - done) * (total - num_done) if num_done > done else math.inf
                 eta = f", about {left:.0f} s to go" if math.isfinite(left) else ""
             fraction = num_done / total if total else 1.0
-            print(f"{title}: {fraction:.0%}{eta}  {note}".rstrip(), file=sys.stderr, flush=True)
+            print_line(f"{title}: {fraction:.0%}{eta}  {note}".rstrip(), file=sys.stderr)
 
     return advance

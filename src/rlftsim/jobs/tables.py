@@ -4,42 +4,57 @@ The only module that opens Parquet or Arrow files. Arrow trusts the offsets and 
 validated: a wrong offset is followed out of the file, which ends the process.
 """
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from os import PathLike, fspath, stat
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rlftsim.errors import DataError, RlftsimError
-from rlftsim.jobs.documents import first_line
+from rlftsim.jobs.documents import check_has_end, first_line
 
 MAX_VALUES = 1 << 27
 """Values that a Parquet file may hold, however small it is: 1 GiB of numbers."""
 MAX_VALUES_PER_BYTE = 100
 """Values a byte of a larger Parquet file; columns that hardly vary are packed far better than others."""
+MAX_TABLE_BYTES, MAX_BYTES_PER_BYTE = 3 << 29, 16
+"""Memory that reading a Parquet file may take, and the same for each byte of the file: repeated values are packed a
+million times smaller."""
+_memory_limit = threading.Lock()
 _ARROW_BEGINNING = b"ARROW1\0\0"
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, pa.ArrowException)
 
 
-def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError) -> pa.Table:
+def read_parquet(
+    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
+) -> pa.Table:
     """Validated table of a Parquet file.
 
     Args:
         path: Parquet file; a folder is none.
         remedy: Way out at the end of every message, such as "convert again".
         error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
-        FileNotFoundError: No such file; the caller names the file in the message.
+        FileNotFoundError: No such file, and no message for that.
         RlftsimError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can
             explain.
     """
     try:
-        with pq.ParquetFile(path) as file:
-            _check_size(file.metadata, stat(path).st_size)
-            # in batches: memory for as many values as a damaged column tells would be taken at once
-            return _validate_table(pa.Table.from_batches(file.iter_batches(), file.schema_arrow))
+        check_has_end(path)
+        num_bytes = stat(path).st_size
+        with _limited_memory(MAX_TABLE_BYTES + MAX_BYTES_PER_BYTE * num_bytes), pq.ParquetFile(path) as file:
+            _check_size(file.metadata, num_bytes)
+            # in batches: memory for as many values as a damaged column tells would be taken at once; without threads,
+            # whose stacks would count as memory
+            return _validate_table(pa.Table.from_batches(file.iter_batches(use_threads=False), file.schema_arrow))
     except FileNotFoundError:
+        if missing:
+            raise error(missing) from None
         raise
     except _DAMAGE as problem:
         raise error(f"{path}: cannot be read ({_describe_cause(problem)}): {remedy}.") from None
@@ -59,6 +74,7 @@ def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
         DataError: Damaged or compressed file, or text that is no UTF-8.
     """
     try:
+        check_has_end(path)
         file = pa.memory_map(fspath(path))
         reader = pa.ipc.open_file(file)
         file.seek(len(_ARROW_BEGINNING))
@@ -78,6 +94,7 @@ def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
 def read_parquet_metadata(path: str | PathLike[str]) -> Mapping[bytes, bytes]:
     """Metadata in the schema of a Parquet file; empty where there are none, or no such file."""
     try:
+        check_has_end(path)
         return pq.read_schema(path).metadata or {}
     except _DAMAGE:
         return {}
@@ -104,6 +121,28 @@ def check_columns(table: pa.Table, schema: pa.Schema) -> None:
             raise DataError(f"column {field.name} holds {str(column.type)[:40]}, not {field.type}")
         if column.null_count:
             raise DataError(f"column {field.name} has empty cells")
+
+
+@contextmanager
+def _limited_memory(num_bytes: int) -> Iterator[None]:
+    """Let this process take a number of bytes more at the most: what is beyond ends in a MemoryError.
+
+    The sizes in a file do not tell what pyarrow will take: a text of a megabyte that is repeated is stored once.
+    """
+    try:
+        import resource
+    except ImportError:  # no such limits on this platform
+        yield
+        return
+    with _memory_limit:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        before = resource.getrlimit(resource.RLIMIT_AS)
+        limits = [limit for limit in (used + num_bytes, *before) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(limits), before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def _validate_table(table: pa.Table) -> pa.Table:
@@ -146,4 +185,6 @@ def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:
 
 
 def _describe_cause(problem: BaseException) -> str:
+    if isinstance(problem, MemoryError):
+        return "it unfolds to more than its size explains"
     return "a name is not text in UTF-8" if isinstance(problem, UnicodeDecodeError) else first_line(problem)

@@ -14,10 +14,10 @@ import difflib
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -255,7 +255,7 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
     is_valid = {name: weights[name].isfinite() if name in parameters else ~weights[name].isnan() for name in expected}
     broken = [name for name, valid in is_valid.items() if not valid.all()]
     if broken:
-        names = _join_first(broken, ", ")
+        names = join_first(broken, ", ")
         raise CheckpointError(f"{source}: weights are not finite ({names}): take an earlier checkpoint or train again.")
     module.load_state_dict(weights)
 
@@ -286,23 +286,24 @@ def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], 
     """
     problems = [f"missing {k}" for k in sorted(expected.keys() - weights.keys())]
     problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - expected.keys())]
-    pairs = [(k, weights[k], expected[k]) for k in sorted(expected.keys() & weights.keys())]
-    problems += [
-        f"{k} has shape {tuple(weight.shape)} instead of {tuple(model.shape)}"
-        for k, weight, model in pairs
-        if weight.shape != model.shape
-    ]
-    problems += [
-        f"{k} holds {weight.dtype} instead of {model.dtype}"
-        for k, weight, model in pairs
-        if weight.dtype != model.dtype and not {weight.dtype, model.dtype} <= _FLOATS
-    ]
+    for k in sorted(expected.keys() & weights.keys()):
+        (shape, dtype), (model_shape, model_dtype) = ((w[k].shape, w[k].dtype) for w in (weights, expected))
+        if shape != model_shape:
+            problems.append(f"{k} has shape {tuple(shape)} instead of {tuple(model_shape)}")
+        if dtype != model_dtype and not {dtype, model_dtype} <= _FLOATS:
+            problems.append(f"{k} holds {dtype} instead of {model_dtype}")
     if problems:
-        text = printable(_join_first(problems, "; "))
+        text = printable(join_first(problems, "; "))
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {text}.")
 
 
-def _join_first(problems: list[str], separator: str) -> str:
+def join_first(problems: list[str], separator: str) -> str:
+    """The first few of some problems as a text, followed by an ellipsis where there are more.
+
+    Args:
+        problems: Problems in the order to be shown.
+        separator: Text between two problems.
+    """
     return separator.join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
 
 
@@ -326,16 +327,36 @@ def outline(make: Callable[[], nn.Module]) -> dict[str, Tensor]:
         return make().state_dict()
 
 
-def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Check that weights fit a network before the network is built: damaged settings may ask for any memory.
+def load_network(make: Callable[[], Loaded], weights: Mapping[str, Tensor], *, source: Path) -> Loaded:
+    """Policy whose `network` has the given weights.
+
+    The weights are compared with an outline before the policy is built: damaged settings may ask for any memory.
 
     Args:
-        make: Function that builds the network on torch's default device, which has no memory here.
-        weights: Stored weights by name.
-        source: File or folder of the weights, which the message of an error names.
+        make: Function that builds the policy on torch's default device.
+        weights: Stored weights of the network by name.
+        source: Folder of the weights, which the message of an error names.
 
     Raises:
-        CheckpointError: The weights have other names, shapes or number types.
+        CheckpointError: The weights have other names, shapes or number types, or are not finite.
     """
-    expected = outline(make)
-    check_shapes(strip_wrappers(weights, expected), expected, source=source)
+    expected = outline(lambda: cast(Any, make()).network)
+    check_shapes(strip_wrappers(weights, expected), expected, source=str(source))
+    policy: Any = make()
+    load_strictly(policy.network, weights, source=str(source))
+    return policy
+
+
+def are_frozen_alike(weights: Iterable[Tensor], reference: Iterable[Tensor]) -> bool:
+    """True if the weights of two models are equal, and no weight requires a gradient.
+
+    Args:
+        weights: Weights of the first model.
+        reference: Weights of the second model, in the same order and of the same shapes.
+    """
+    pairs = list(zip(weights, reference, strict=True))
+    if any(weight.requires_grad for pair in pairs for weight in pair):
+        return False
+    # a single tensor, which the host waits for once
+    differs = [(weight != counterpart).any() for weight, counterpart in pairs if weight is not counterpart]
+    return not differs or not bool(torch.stack(differs).any())

@@ -19,7 +19,6 @@ from torch import nn
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.policies import SHIPPED_POLICIES
-from rlftsim.policies.checkpoint import find_model as find_model
 from rlftsim.policies.checkpoint import find_similar_model, read_model
 from rlftsim.rollout.policy import LoadablePolicy, Policy
 
@@ -27,7 +26,7 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
     "policy",
     "rlftsim.policies",
     SHIPPED_POLICIES,
-    use=lambda name: load_policy(name) if _needs_no_arguments(POLICIES.get(name)) else _loadable(name),
+    use=lambda name: load_policy(name) if needs_no_arguments(POLICIES.get(name)) else _loadable(name),
 )
 """Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""
 
@@ -70,7 +69,7 @@ def _load(name: str | os.PathLike, device: Device, *extra_names: str) -> Policy:
     torch_device = find_device(device)  # first, so that a policy without weights refuses a wrong word, too
     # anything with a separator is a path: no entry point of another package is imported for it
     registered = POLICIES.find(name) if isinstance(name, str) and Path(name).name == name else None
-    if registered is not None and _needs_no_arguments(registered):
+    if registered is not None and needs_no_arguments(registered):
         try:
             policy = registered()
         except SystemExit as stop:  # it would end the command, with exit() even as if all were done
@@ -85,7 +84,7 @@ def _load(name: str | os.PathLike, device: Device, *extra_names: str) -> Policy:
         raise ConfigError("'oracle' stands for the log itself and is no policy: only evaluate takes it.")
     else:
         # names that are policies by themselves: an architecture that needs weights is no answer
-        names = [name for name in POLICIES.names() if _needs_no_arguments(POLICIES.get(name))]
+        names = [name for name in POLICIES.names() if needs_no_arguments(POLICIES.get(name))]
         names += extra_names
         matches = difflib.get_close_matches(str(name), names, n=1)
         match = matches[0] if matches else find_similar_model(Path(name).expanduser())
@@ -114,7 +113,8 @@ def _loadable(architecture: str) -> LoadablePolicy:
     return cls
 
 
-def _needs_no_arguments(make: Any) -> bool:
+def needs_no_arguments(make: Any) -> bool:
+    """True for what makes a policy without a folder: a policy by its name alone."""
     try:
         inspect.signature(make).bind()
     except (TypeError, ValueError):  # ValueError: built-in classes and functions may have no signature

@@ -4,9 +4,7 @@
 `score_batch_features` and `AgentScores`, where several readers share the features. Independent of models and rewards.
 """
 
-from rlftsim.realism.agent_scores import AgentScores
 from rlftsim.realism.agents import SimulatedStates
-from rlftsim.realism.batch import ScenarioFeatures, compute_batch_features, score_batch, score_batch_features
 from rlftsim.realism.config import (
     FEATURE_NAMES,
     METRIC_2023,
@@ -17,34 +15,22 @@ from rlftsim.realism.config import (
     MetricConfig,
     metric_by_name,
 )
-from rlftsim.realism.credit import Credit, compute_credit, compute_single_credit
+from rlftsim.realism.credit import AgentScores, Credit, compute_credit, compute_single_credit
 from rlftsim.realism.features import ComputeConfig, Features, ScenarioLog, compute_features, scenario_log
-from rlftsim.realism.meta_metric import RealismResult, score, score_features
+from rlftsim.realism.meta_metric import (
+    RealismResult,
+    ScenarioFeatures,
+    compute_batch_features,
+    score,
+    score_batch,
+    score_batch_features,
+    score_features,
+)
 
 __all__ = [
-    "FEATURE_NAMES",
-    "METRICS",
-    "METRIC_2023",
-    "METRIC_2024",
-    "METRIC_2024_ORIGINAL",
-    "METRIC_2025",
-    "AgentScores",
-    "ComputeConfig",
-    "Credit",
-    "Features",
-    "MetricConfig",
-    "RealismResult",
-    "ScenarioFeatures",
-    "ScenarioLog",
-    "SimulatedStates",
-    "compute_batch_features",
-    "compute_credit",
-    "compute_features",
-    "compute_single_credit",
-    "metric_by_name",
-    "scenario_log",
-    "score",
-    "score_batch",
-    "score_batch_features",
+    "FEATURE_NAMES", "METRICS", "METRIC_2023", "METRIC_2024", "METRIC_2024_ORIGINAL", "METRIC_2025",
+    "AgentScores", "ComputeConfig", "Credit", "Features", "MetricConfig", "RealismResult", "ScenarioFeatures",
+    "ScenarioLog", "SimulatedStates", "compute_batch_features", "compute_credit", "compute_features",
+    "compute_single_credit", "metric_by_name", "scenario_log", "score", "score_batch", "score_batch_features",
     "score_features",
-]
+]  # fmt: skip

@@ -17,6 +17,9 @@ from torch import Tensor
 from rlftsim.errors import DataError
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, ObjectType, Scenario
 
+NUM_HISTORY_STEPS = 2
+"""Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedStates:
@@ -268,25 +271,20 @@ def match_agents(
     if missing_ids or unlogged_ids or len(rollout_ids) != len(logged_ids):
         unique, counts = np.unique(rollout_ids, return_counts=True)
         repeated_ids = unique[counts > 1].tolist()
-        reasons = (
-            ("listed twice", repeated_ids),
-            ("missing", missing_ids),
-            ("not simulated in this scenario", unlogged_ids),
-        )
+        reasons = {"listed twice": repeated_ids, "missing": missing_ids, "not simulated in this scenario": unlogged_ids}
         raise DataError(
             f"Rollouts of scenario {scenario_id} must hold every track valid at the current step and no other: "
-            f"object ids {'; '.join(f'{reason} {_shorten(ids)}' for reason, ids in reasons if ids)}."
+            f"object ids {'; '.join(f'{reason} {_shorten(ids)}' for reason, ids in reasons.items() if ids)}."
         )
     return order[np.searchsorted(rollout_ids[order], logged_ids)]
 
 
-def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, scenario_id: str) -> Trajectories:
-    """Rollouts in track order with logged history in front: [N, A, history_steps + 80].
+def join_history(agents: LoggedAgents, states: SimulatedStates, scenario_id: str) -> Trajectories:
+    """Rollouts in track order with two steps of logged history in front: [N, A, 82].
 
     Args:
         agents: Agents of the scenario as logged, whose order the result has.
         states: N rollouts of exactly these agents, in any order.
-        history_steps: Number of logged steps in front; the last of them is the current step.
         scenario_id: Scenario that messages name.
 
     Raises:
@@ -296,7 +294,7 @@ def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: i
     # Rollouts of our own policies come in track order already: no copy then.
     is_ordered = bool((order == np.arange(len(order))).all())
     index = None if is_ordered else torch.from_numpy(order).to(states.device)
-    first = CURRENT_STEP + 1 - history_steps
+    first = CURRENT_STEP + 1 - NUM_HISTORY_STEPS
 
     def prepend(log: Tensor, future: Tensor) -> Tensor:
         future = future if index is None else future.index_select(1, index)

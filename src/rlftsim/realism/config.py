@@ -1,7 +1,7 @@
 """Configurations of the realism meta-metric: ranges, bins, pseudocounts and weights of each year's challenge.
 
 Each metric year is an entry of `METRICS`, with the numbers of the challenge's published configuration files. Every
-feature axis F of a tensor has the order of `FEATURE_NAMES`.
+feature axis F of a tensor has the order of `FEATURE_NAMES`. Official messages have other names for some scores.
 """
 
 from dataclasses import dataclass, replace
@@ -9,14 +9,9 @@ from dataclasses import dataclass, replace
 from rlftsim.errors import ConfigError, in_short
 
 HISTOGRAM_FEATURES = (
-    "linear_speed",
-    "linear_acceleration",
-    "angular_speed",
-    "angular_acceleration",
-    "distance_to_nearest_object",
-    "time_to_collision",
-    "distance_to_road_edge",
-)
+    "linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration",
+    "distance_to_nearest_object", "time_to_collision", "distance_to_road_edge",
+)  # fmt: skip
 BERNOULLI_FEATURES = ("collision_indication", "offroad_indication", "traffic_light_violation")
 FEATURE_NAMES = HISTOGRAM_FEATURES + BERNOULLI_FEATURES
 """Order of the feature axis F."""
@@ -27,6 +22,27 @@ SUB_SCORES = {
     "map_based": ("distance_to_road_edge", "offroad_indication", "traffic_light_violation"),
 }
 """Families of features and their members."""
+LIGHT = "traffic_light_violation"
+_RATES = {
+    "collision_rate": "simulated_collision_rate",
+    "offroad_rate": "simulated_offroad_rate",
+    "traffic_light_violation_rate": "simulated_traffic_light_violation_rate",
+}
+_FIELDS = {
+    "meta_metric": "metametric",
+    "average_displacement_error": "average_displacement_error",
+    "min_average_displacement_error": "min_average_displacement_error",
+    **{f"{feature}_likelihood": f"{feature}_likelihood" for feature in FEATURE_NAMES},
+    **_RATES,
+}
+_BUCKETS = {
+    "meta_metric": "realism_meta_metric",
+    "kinematic": "kinematic_metrics",
+    "interactive": "interactive_metrics",
+    "map_based": "map_based_metrics",
+    "min_average_displacement_error": "min_ade",
+    **_RATES,
+}
 
 
 @dataclass(frozen=True)
@@ -153,3 +169,23 @@ def metric_by_name(name: str) -> MetricConfig:
     if name not in METRICS:
         raise ConfigError(f"Unknown metric {in_short(name)}: known are {', '.join(METRICS)}.")
     return METRICS[name]
+
+
+def is_reported(score: str, config: MetricConfig) -> bool:
+    """True if the official result of a year has a score.
+
+    Args:
+        score: Name of the score here, such as `RealismResult` has it; not the official name.
+        config: Year of the metric; results before 2025 may lack traffic lights.
+    """
+    return config.reports_traffic_lights or LIGHT not in score
+
+
+def official_fields(config: MetricConfig) -> dict[str, str]:
+    """Official names of a scenario's scores in a year, by our names."""
+    return {name: official_name for name, official_name in _FIELDS.items() if is_reported(name, config)}
+
+
+def official_buckets(config: MetricConfig) -> dict[str, str]:
+    """Official names of the sub-scores and of further figures in a year, by our names."""
+    return {name: official_name for name, official_name in _BUCKETS.items() if is_reported(name, config)}

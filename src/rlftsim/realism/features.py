@@ -23,18 +23,19 @@ from rlftsim.realism.agents import (
     join_history,
     join_trajectories,
 )
-from rlftsim.realism.displacement import compute_displacement_error
 from rlftsim.realism.interactive import PlanarAgents, compute_distance_to_nearest_object, compute_time_to_collision
-from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity
+from rlftsim.realism.kinematic import (
+    compute_displacement_error,
+    compute_ground_speed,
+    compute_kinematics,
+    shrink_validity,
+)
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge, join_road_edges
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation, join_signals
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario, cached_on_scenario
 
 MissingMap = Literal["error", "neutral"]
 
-NUM_HISTORY_STEPS = 2
-"""Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
 INVALID_ROAD_EDGE_M = -1e10
 """Distance to the road edge of invalid agents, as officially; also of all agents in a scenario without road edges."""
 CACHED_LOGS = 64
@@ -118,9 +119,9 @@ class ScenarioLog:
     """Features of the log, N = 1."""
 
     @property
-    def scenario_ids(self) -> tuple[str, ...]:
-        """The scenario's id, as the only entry."""
-        return (self.scenario_id,)
+    def logs(self) -> "tuple[ScenarioLog, ...]":
+        """The log itself, as the only entry."""
+        return (self,)
 
     @property
     def leaves_road(self) -> Bool[Tensor, "E"]:
@@ -146,11 +147,6 @@ class JoinedLogs:
             join_road_edges([log.road_edges for log in logs]),
             join_signals([log.signals for log in logs]),
         )
-
-    @property
-    def scenario_ids(self) -> tuple[str, ...]:
-        """Ids of the scenarios."""
-        return tuple(log.scenario_id for log in self.logs)
 
     @property
     def leaves_road(self) -> Bool[Tensor, "E"]:
@@ -224,7 +220,7 @@ def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap
     # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.
     log = Trajectories(*(values[None] for values in agents.trajectories))
     with torch.no_grad():
-        features = _measure_trajectories(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
+        features = _measure(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
     return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
 
 
@@ -242,21 +238,15 @@ def compute_features(
     Raises:
         DataError: The agents of the rollouts are not the scenario's simulated agents.
     """
-    logs = log.logs if isinstance(log, JoinedLogs) else (log,)
     states = [states] if isinstance(states, SimulatedStates) else states
-    histories = [
-        join_history(scene.agents, rollouts, NUM_HISTORY_STEPS, scene.scenario_id)
-        for scene, rollouts in zip(logs, states)
-    ]
+    histories = [join_history(scene.agents, s, scene.scenario_id) for scene, s in zip(log.logs, states)]
     trajectories = histories[0] if len(histories) == 1 else join_trajectories(histories)  # [N, A, 82]
     max_pairs = compute.pairs_on(states[0].device)
-    features = _measure_trajectories(
-        trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs
-    )
+    features = _measure(trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
     return replace(features, repeat=states[0].repeat)
 
 
-def _measure_trajectories(
+def _measure(
     trajectories: Trajectories,
     agents: LoggedAgents,
     road_edges: RoadEdges | None,
@@ -317,23 +307,17 @@ def _compute_interaction(
 
 
 def _compute_road_edge(
-    future: Trajectories,
-    agents: LoggedAgents,
-    road_edges: RoadEdges | None,
-    valid: Bool[Tensor, "N E T"],
-    max_pairs: int,
+    future: Trajectories, agents: LoggedAgents, edges: RoadEdges | None, valid: Bool[Tensor, "N E T"], max_pairs: int
 ) -> Float[Tensor, "N E T"]:
-    if road_edges is None:
+    if edges is None:
         return torch.full_like(future.x, INVALID_ROAD_EDGE_M)
     size = agents.size.index_select(0, agents.evaluated)
     # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
     # the current position instead; their distance is overwritten below.
     current = agents.trajectories.select_agents(agents.evaluated)
-    filled_states = Trajectories(
-        *(torch.where(valid, x, logged[:, CURRENT_STEP, None]) for x, logged in zip(future, current))
-    )
+    states = Trajectories(*(torch.where(valid, x, log[:, CURRENT_STEP, None]) for x, log in zip(future, current)))
     scenario = None if agents.layout is None else agents.layout.scenario
-    distance = compute_distance_to_road_edge(filled_states, size, road_edges, max_pairs=max_pairs, scenario=scenario)
-    if scenario is not None and road_edges.has_edges is not None:
-        valid = valid & road_edges.has_edges[scenario, None]
+    distance = compute_distance_to_road_edge(states, size, edges, max_pairs=max_pairs, scenario=scenario)
+    if scenario is not None and edges.has_edges is not None:
+        valid = valid & edges.has_edges[scenario, None]
     return torch.where(valid, distance, INVALID_ROAD_EDGE_M)

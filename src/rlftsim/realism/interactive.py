@@ -26,6 +26,8 @@ SMALL_HEADING_DIFFERENCE = math.radians(10.0)
 SMALL_OVERLAP_M = 0.5
 BOUND_SLACK_M = 0.05
 """Far above the rounding of float32 world coordinates: bounds may be loose, never wrong."""
+Corners = tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]
+"""x and y of the corners of P rectangles, counter-clockwise."""
 
 
 class PlanarAgents(NamedTuple):
@@ -133,18 +135,14 @@ def _compute_core_corners(
     return x, y, rounding
 
 
-def _start_at_lowest(
-    x: Float[Tensor, "4 P"], y: Float[Tensor, "4 P"]
-) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]:
+def _start_at_lowest(x: Float[Tensor, "4 P"], y: Float[Tensor, "4 P"]) -> Corners:
     """The corners, rotated until the lowest corner comes first."""
     first = y.argmin(0, keepdim=True)
     order = (first + torch.arange(4, device=x.device)[:, None]) % 4
     return x.gather(0, order), y.gather(0, order)
 
 
-def _add_rectangles(
-    a: tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]], b: tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]
-) -> tuple[Float[Tensor, "8 P"], Float[Tensor, "8 P"]]:
+def _add_rectangles(a: Corners, b: Corners) -> tuple[Float[Tensor, "8 P"], Float[Tensor, "8 P"]]:
     """Vertices of the Minkowski sum of two rectangles, counter-clockwise.
 
     The rectangle with the first edge is chosen once, at the lowest corners, as in the official evaluator. Between

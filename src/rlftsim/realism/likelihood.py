@@ -58,15 +58,9 @@ def histogram_table(config: MetricConfig, device: torch.device) -> HistogramTabl
         edges[row, : histogram.num_bins + 1] = compute_bin_edges(histogram)
     rows = [[h.low, h.high, h.pseudocount, h.num_bins] for h in histograms]  # [H, 4]
     low, high, pseudocount, num_bins = torch.tensor(rows, device=device).unbind(1)
-    return HistogramTable(
-        edges=torch.from_numpy(edges).to(device),
-        low=low,
-        high=high,
-        last_bin=num_bins.long() - 1,
-        pseudocount=pseudocount,
-        num_bins=num_bins,
-        bernoulli_pseudocount=torch.tensor([b.pseudocount for b in config.bernoullis], device=device),
-    )
+    bernoulli = torch.tensor([b.pseudocount for b in config.bernoullis], device=device)
+    edges = torch.from_numpy(edges).to(device)
+    return HistogramTable(edges, low, high, num_bins.long() - 1, pseudocount, num_bins, bernoulli)
 
 
 def find_bins(values: Float[Tensor, "H m"], table: HistogramTable) -> Int64[Tensor, "H m"]:
@@ -144,8 +138,9 @@ def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "
     return torch.stack([speed, acceleration, speed, acceleration, valid, collision_time, valid])
 
 
-def build_log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
-    """Bins and outcomes of the log.
+@lru_cache(maxsize=CACHED_LOGS)
+def log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
+    """Bins and outcomes of the log, cached (logs are compared by identity).
 
     Args:
         log: Logged side of the scenario, or of several side by side.
@@ -165,10 +160,6 @@ def build_log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
     bins = find_bins(values.flatten(1), table).view(values.shape)
     steps_in_bin = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, is_scored)
     return LogTarget(steps_in_bin, is_scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
-
-
-log_target = lru_cache(maxsize=CACHED_LOGS)(build_log_target)
-"""`build_log_target`, cached (logs are compared by identity)."""
 
 
 @dataclass(frozen=True, eq=False)

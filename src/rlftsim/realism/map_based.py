@@ -26,6 +26,8 @@ CLOSED_SQUARED_M2 = 1.0
 """Polylines whose ends are nearer than this (squared, in space) are closed."""
 GROUP_STEPS = 8
 """Steps of one agent whose corners share a list of nearby road edges in the search."""
+SegmentArrays = tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "s d"], Int64[np.ndarray, "s"]]
+"""Both ends and the polyline of every segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +58,8 @@ def select_polylines(features: MapFeatures, types: tuple[int, ...]) -> Polylines
     return Polylines(feature, features.points[source].astype(np.float32), first, count)
 
 
-def _cut_segments(
-    polylines: Polylines,
-) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"], Int64[np.ndarray, "s"]]:
-    """Both ends and the polyline of every segment."""
+def _cut_segments(polylines: Polylines) -> SegmentArrays:
+    """All segments of polylines."""
     # Every point but the last one of each polyline begins a segment.
     starts = np.delete(np.arange(len(polylines.points)), polylines.first + polylines.count - 1)
     owner = np.repeat(np.arange(len(polylines.count)), polylines.count - 1)

@@ -2,29 +2,42 @@
 
 Source: Waymo Open Sim Agents Challenge; RLFTSim, equation 1. The rewards of RLFTSim (equation 2) are made of the
 leave-one-out and single-rollout values, which cost a single reduction over per-rollout counts.
+
+Of several scenarios features are computed once, then scored by any number of metrics. A CPU measures scenarios one by
+one, which stay in the CPU's cache. A device measures all scenarios side by side, so that the host's requests do not
+grow with the number of scenarios.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.errors import DataError
 from rlftsim.realism.agents import SimulatedStates, mean_over_agents, sum_over_agents
-from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
+from rlftsim.realism.config import (
+    FEATURE_NAMES,
+    METRIC_2025,
+    SUB_SCORES,
+    MetricConfig,
+    official_buckets,
+    official_fields,
+)
 from rlftsim.realism.features import (
     DEFAULT_COMPUTE,
     AnyLog,
     ComputeConfig,
     Features,
+    JoinedLogs,
     MissingMap,
     ScenarioLog,
     compute_features,
     scenario_log,
 )
 from rlftsim.realism.likelihood import RolloutCounts, compute_likelihoods, count_rollouts, histogram_table, log_target
-from rlftsim.realism.official_names import official_buckets, official_fields
 from rlftsim.scenario.types import Scenario
 
 
@@ -156,7 +169,6 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     leave_one_out, single = (scores.repeat_interleave(repeat, -1) for scores in rmm[..., 1:].split(num_distinct, -1))
     if num_distinct * repeat == 1:
         leave_one_out = torch.full_like(leave_one_out, torch.nan)
-    meta_metric, kinematic, interactive, map_based = (_weigh(likelihoods[0], row) for row in weights)
     # 3. Reported beside the metric, for each rollout [*B, N].
     displacement = _mean_per_rollout(features.displacement_error, log, repeat)
     collision = _compute_rate(features.collision, log, repeat)
@@ -167,13 +179,10 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     num_staying = sum_over_agents(stays_on_road.to(torch.float32), log.agents.layout)
     light = _compute_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
-        scenario_ids=log.scenario_ids,
-        config=config,
-        likelihoods=likelihoods[0],
-        meta_metric=meta_metric,
-        kinematic=kinematic,
-        interactive=interactive,
-        map_based=map_based,
+        tuple(scene.scenario_id for scene in log.logs),
+        config,
+        likelihoods[0],
+        *(_weigh(likelihoods[0], row) for row in weights),  # the meta-metric, then the sub-scores
         average_displacement_error=displacement.mean(-1),
         min_average_displacement_error=displacement.amin(-1),
         collision_rate=collision.mean(-1),
@@ -211,3 +220,89 @@ def score(
     """
     log = scenario_log(scenario, states.device, missing_map=missing_map, compute=compute)
     return score_features(log, compute_features(log, states, compute=compute), config)
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioFeatures:
+    """Logged side of a scenario, or of several side by side, and the features of the rollouts."""
+
+    log: AnyLog
+    features: Features
+
+
+def compute_batch_features(
+    scenarios: Sequence[Scenario | ScenarioLog],
+    states: Sequence[SimulatedStates],
+    *,
+    missing_map: MissingMap = "error",
+    compute: ComputeConfig = DEFAULT_COMPUTE,
+) -> tuple[ScenarioFeatures, ...]:
+    """Features of B scenarios with N rollouts each, on the rollouts' device: an entry per scenario, or a joint entry.
+
+    Args:
+        scenarios: B logged scenarios, or the `scenario_log` of each.
+        states: Rollouts of each scenario, in the order of the scenarios; N is the same for all.
+        missing_map: Answer to a scenario without road edges: "error" raises, "neutral" counts all agents as on-road.
+        compute: Bound on the memory of the computation; changes no result.
+
+    Raises:
+        DataError: A scenario cannot be scored, or the agents of the rollouts are not the scenario's simulated agents;
+            there is no scenario, or the numbers of scenarios or rollouts differ.
+    """
+    if len(scenarios) != len(states) or not scenarios:
+        raise DataError(f"Scoring needs one set of rollouts per scenario, got {len(states)} for {len(scenarios)}.")
+    sizes = sorted({rollouts.num_rollouts for rollouts in states})
+    if len(sizes) > 1:
+        raise DataError(f"Scenarios scored together need equally many rollouts, got {sizes}: score them one by one.")
+    logs = [
+        scenario_log(scenario, rollouts.device, missing_map=missing_map, compute=compute)
+        for scenario, rollouts in zip(scenarios, states)
+    ]
+    # Side by side all have the same number of distinct rollouts.
+    can_join = len({rollouts.repeat for rollouts in states}) == 1
+    if can_join and states[0].device.type != "cpu":
+        joined_logs = JoinedLogs.from_logs(logs)
+        return (ScenarioFeatures(joined_logs, compute_features(joined_logs, states, compute=compute)),)
+    return tuple(ScenarioFeatures(log, compute_features(log, s, compute=compute)) for log, s in zip(logs, states))
+
+
+def score_batch_features(features: Sequence[ScenarioFeatures], config: MetricConfig = METRIC_2025) -> RealismResult:
+    """Scores of B scenarios from features, stacked: [B], [B, F] and [B, N].
+
+    Args:
+        features: Features of all scenarios, from `compute_batch_features`.
+        config: Year of the metric: bins, weights and rules.
+    """
+    results = [score_features(scene.log, scene.features, config) for scene in features]
+    if isinstance(features[0].log, JoinedLogs):
+        return results[0]
+    columns = {
+        field.name: torch.stack([getattr(result, field.name) for result in results])
+        for field in fields(RealismResult)
+        if field.name not in ("scenario_ids", "config")
+    }
+    return RealismResult(scenario_ids=tuple(r.scenario_ids[0] for r in results), config=config, **columns)
+
+
+def score_batch(
+    scenarios: Sequence[Scenario | ScenarioLog],
+    states: Sequence[SimulatedStates],
+    config: MetricConfig = METRIC_2025,
+    *,
+    missing_map: MissingMap = "error",
+    compute: ComputeConfig = DEFAULT_COMPUTE,
+) -> RealismResult:
+    """Scores of B scenarios with N rollouts each, stacked: [B], [B, F] and [B, N].
+
+    Args:
+        scenarios: B logged scenarios, or the `scenario_log` of each.
+        states: Rollouts of each scenario, in the order of the scenarios; N is the same for all.
+        config: Year of the metric: bins, weights and rules.
+        missing_map: Answer to a scenario without road edges: "error" raises, "neutral" counts all agents as on-road.
+        compute: Bound on the memory of the computation; changes no result.
+
+    Raises:
+        DataError: The same causes as in `compute_batch_features`.
+    """
+    features = compute_batch_features(scenarios, states, missing_map=missing_map, compute=compute)
+    return score_batch_features(features, config)

@@ -169,85 +169,79 @@ def _squared_limit(key: Int64[Tensor, "..."]) -> Float[Tensor, "..."]:
     return (distance * 1.0001 + 0.001).square_()
 
 
-def _search_chunks(
-    points: Float[Tensor, "n D"],
-    segments: ChunkedSegments,
-    rule: DistanceRule,
-    pairs: tuple[Int64[Tensor, "P"], Int64[Tensor, "P"]],
-    max_pairs: int,
-) -> Int64[Tensor, "P"]:
-    """Key of the nearest segment of a chunk, for each (point, chunk) pair."""
-    keys = []
-    size = max(1, max_pairs // CHUNK_SEGMENTS)
-    for row, chunk in zip(pairs[0].split(size), pairs[1].split(size)):
-        squared = rule(points[row], segments, chunk)
-        distance = compute_sqrt(squared.amin(-1))
-        # Ties are between distances, not their squares: rounding the root makes more of them equal.
-        slot = (squared <= compute_largest_square(distance)[:, None]).to(torch.uint8).argmax(-1)
-        keys.append(_to_key(distance, chunk * CHUNK_SEGMENTS + slot))
-    return keys[0] if len(keys) == 1 else torch.cat(keys)
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A search for the nearest segments of points [n, D], by a rule."""
 
+    segments: ChunkedSegments
+    rule: DistanceRule
+    max_pairs: int
 
-def _widen(
-    points: Float[Tensor, "n D"],
-    segments: ChunkedSegments,
-    rule: DistanceRule,
-    key: Int64[Tensor, "n"],
-    open_rows: Int64[Tensor, "r"],
-    scenario: Int64[Tensor, "n"] | None,
-    max_pairs: int,
-) -> None:
-    """Search all chunks for the points with too short a list; lowers `key` in place."""
-    for rows in open_rows.split(max(1, max_pairs // segments.low.shape[-1])):
-        position = points[rows].T[:, :, None]  # [D, r, 1]
-        low, high, first_chunk = segments.select_scenarios(None if scenario is None else scenario[rows])
-        bound = _squared_box_distance((position, position), (low, high), segments.axis_scale)  # [r, M]
-        row, chunk = (bound <= _squared_limit(key[rows])[:, None]).nonzero().unbind(-1)
-        chunk = chunk + first_chunk.expand(len(rows), 1)[row, 0]
-        row = rows[row]
-        key.scatter_reduce_(0, row, _search_chunks(points, segments, rule, (row, chunk), max_pairs), "amin")
+    def search_chunks(
+        self, points: Float[Tensor, "n D"], rows: Int64[Tensor, "P"], chunks: Int64[Tensor, "P"]
+    ) -> Int64[Tensor, "P"]:
+        """Key of the nearest segment of a chunk, for each pair of a point and a chunk."""
+        keys = []
+        size = max(1, self.max_pairs // CHUNK_SEGMENTS)
+        for row, chunk in zip(rows.split(size), chunks.split(size)):
+            squared = self.rule(points[row], self.segments, chunk)
+            distance = compute_sqrt(squared.amin(-1))
+            # Ties are between distances, not their squares: rounding the root makes more of them equal.
+            slot = (squared <= compute_largest_square(distance)[:, None]).to(torch.uint8).argmax(-1)
+            keys.append(_to_key(distance, chunk * CHUNK_SEGMENTS + slot))
+        return keys[0] if len(keys) == 1 else torch.cat(keys)
 
+    def widen(
+        self,
+        points: Float[Tensor, "n D"],
+        key: Int64[Tensor, "n"],
+        open_rows: Int64[Tensor, "r"],
+        scenario: Int64[Tensor, "n"] | None,
+    ) -> None:
+        """Search all chunks for the points with too short a list; lowers `key` in place."""
+        for rows in open_rows.split(max(1, self.max_pairs // self.segments.low.shape[-1])):
+            position = points[rows].T[:, :, None]  # [D, r, 1]
+            low, high, first_chunk = self.segments.select_scenarios(None if scenario is None else scenario[rows])
+            bound = _squared_box_distance((position, position), (low, high), self.segments.axis_scale)  # [r, M]
+            row, chunk = (bound <= _squared_limit(key[rows])[:, None]).nonzero().unbind(-1)
+            chunk = chunk + first_chunk.expand(len(rows), 1)[row, 0]
+            row = rows[row]
+            key.scatter_reduce_(0, row, self.search_chunks(points, row, chunk), "amin")
 
-def _search_block(
-    groups: Float[Tensor, "G Q D"],
-    segments: ChunkedSegments,
-    rule: DistanceRule,
-    scenario: Int64[Tensor, "G"] | None,
-    max_pairs: int,
-) -> Int64[Tensor, "n"]:
-    """Keys of a block of groups, n = G Q."""
-    # 1. The chunks nearest to each group's box, and the bound of the first one that is not listed.
-    num_groups, group_size, num_axes = groups.shape
-    points, axes = groups.flatten(0, 1), groups.permute(2, 0, 1)
-    low, high, first_chunk = segments.select_scenarios(scenario)
-    num_chunks = low.shape[-1]
-    num_listed = min(LISTED_CHUNKS, num_chunks)
-    group_box = (axes.amin(-1)[..., None], axes.amax(-1)[..., None])
-    group_bound = _squared_box_distance(group_box, (low, high), segments.axis_scale)  # [G, M]
-    group_bound, chunks = group_bound.topk(min(num_listed + 1, num_chunks), largest=False)
-    chunks = chunks[:, :num_listed]  # [G, L]
-    # 2. Each point searches the nearest chunk of its list.
-    position, index = axes[..., None], chunks.expand(num_axes, -1, -1)  # [D, G, Q, 1], [D, G, L]
-    low, high = (corner.expand(-1, num_groups, -1).gather(-1, index)[:, :, None] for corner in (low, high))
-    bound = _squared_box_distance((position, position), (low, high), segments.axis_scale).flatten(0, 1)  # [n, L]
-    # Indices of padding may lie beyond the last chunk; it is never searched, but for points of scenarios without any.
-    chunks = (chunks + first_chunk).clamp_(max=len(segments.squared_length) - 1).repeat_interleave(group_size, 0)
-    rows = torch.arange(len(points), device=points.device)
-    nearest_chunk = bound.argmin(-1, keepdim=True)
-    key = _search_chunks(points, segments, rule, (rows, chunks.gather(1, nearest_chunk).squeeze(1)), max_pairs)
-    # 3. Then every other listed chunk that may still hold something nearer.
-    may_win = (bound <= _squared_limit(key)[:, None]).scatter_(1, nearest_chunk, False)
-    row, column = may_win.nonzero().unbind(-1)
-    if len(row):
-        pairs = row, chunks[row, column]
-        key.scatter_reduce_(0, row, _search_chunks(points, segments, rule, pairs, max_pairs), "amin")
-    # 4. Points for which an unlisted chunk may hold something nearer search all boxes.
-    if num_listed < num_chunks:
-        unlisted_bound = group_bound[:, num_listed].repeat_interleave(group_size)
-        open_rows = (unlisted_bound <= _squared_limit(key)).nonzero().squeeze(1)
-        point_scenario = None if scenario is None else scenario.repeat_interleave(group_size)
-        _widen(points, segments, rule, key, open_rows, point_scenario, max_pairs)
-    return key
+    def search_block(self, groups: Float[Tensor, "G Q D"], scenario: Int64[Tensor, "G"] | None) -> Int64[Tensor, "n"]:
+        """Keys of a block of groups, n = G Q."""
+        segments = self.segments
+        # 1. The chunks nearest to each group's box, and the bound of the first one that is not listed.
+        num_groups, group_size, num_axes = groups.shape
+        points, axes = groups.flatten(0, 1), groups.permute(2, 0, 1)
+        low, high, first_chunk = segments.select_scenarios(scenario)
+        num_chunks = low.shape[-1]
+        num_listed = min(LISTED_CHUNKS, num_chunks)
+        group_box = (axes.amin(-1)[..., None], axes.amax(-1)[..., None])
+        group_bound = _squared_box_distance(group_box, (low, high), segments.axis_scale)  # [G, M]
+        group_bound, chunks = group_bound.topk(min(num_listed + 1, num_chunks), largest=False)
+        chunks = chunks[:, :num_listed]  # [G, L]
+        # 2. Each point searches the nearest chunk of its list.
+        position, index = axes[..., None], chunks.expand(num_axes, -1, -1)  # [D, G, Q, 1], [D, G, L]
+        low, high = (corner.expand(-1, num_groups, -1).gather(-1, index)[:, :, None] for corner in (low, high))
+        bound = _squared_box_distance((position, position), (low, high), segments.axis_scale).flatten(0, 1)  # [n, L]
+        # Indices of padding may lie beyond the last chunk; only points of scenarios without any search it.
+        chunks = (chunks + first_chunk).clamp_(max=len(segments.squared_length) - 1).repeat_interleave(group_size, 0)
+        rows = torch.arange(len(points), device=points.device)
+        nearest_chunk = bound.argmin(-1, keepdim=True)
+        key = self.search_chunks(points, rows, chunks.gather(1, nearest_chunk).squeeze(1))
+        # 3. Then every other listed chunk that may still hold something nearer.
+        may_win = (bound <= _squared_limit(key)[:, None]).scatter_(1, nearest_chunk, False)
+        row, column = may_win.nonzero().unbind(-1)
+        if len(row):
+            key.scatter_reduce_(0, row, self.search_chunks(points, row, chunks[row, column]), "amin")
+        # 4. Points for which an unlisted chunk may hold something nearer search all boxes.
+        if num_listed < num_chunks:
+            unlisted_bound = group_bound[:, num_listed].repeat_interleave(group_size)
+            open_rows = (unlisted_bound <= _squared_limit(key)).nonzero().squeeze(1)
+            point_scenario = None if scenario is None else scenario.repeat_interleave(group_size)
+            self.widen(points, key, open_rows, point_scenario)
+        return key
 
 
 def find_nearest_segment(
@@ -271,6 +265,7 @@ def find_nearest_segment(
     size = max(1, max_pairs // max(num_chunks, groups.shape[1] * max(LISTED_CHUNKS, CHUNK_SEGMENTS)))
     blocks = groups.split(size)
     scenarios = [None] * len(blocks) if scenario is None else scenario.split(size)
-    keys = [_search_block(block, segments, rule, rows, max_pairs) for block, rows in zip(blocks, scenarios)]
+    search = _Search(segments, rule, max_pairs)
+    keys = [search.search_block(block, rows) for block, rows in zip(blocks, scenarios)]
     slot = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
     return segments.first_segment[slot // CHUNK_SEGMENTS] + slot % CHUNK_SEGMENTS

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from rlftsim.realism.map_based import Polylines, select_polylines
+from rlftsim.realism.map_based import Polylines, SegmentArrays, select_polylines
 from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment, join_chunks
 from rlftsim.scenario.types import TOTAL_STEPS, LightState, LightStates, MapFeatures, MapFeatureType
 
@@ -83,9 +83,7 @@ def _lane_rule(
     return offset_x * offset_x + offset_y * offset_y
 
 
-def _cut_lane_segments(
-    lanes: Polylines,
-) -> tuple[Float[np.ndarray, "s 2"], Float[np.ndarray, "s 2"], Int64[np.ndarray, "s"]]:
+def _cut_lane_segments(lanes: Polylines) -> SegmentArrays:
     """Segments of lanes in the plane, with the segment that the official code adds to every lane but the longest.
 
     The official code pads lanes with zeros to the longest lane and counts a segment if the start is real, so a shorter
@@ -101,9 +99,7 @@ def _cut_lane_segments(
 
 
 def _project_stop_points(
-    lanes: tuple[Float[np.ndarray, "s 2"], Float[np.ndarray, "s 2"], Int64[np.ndarray, "s"]],
-    lane: Int64[np.ndarray, "J"],
-    stop: Float[np.ndarray, "S J 2"],
+    lanes: SegmentArrays, lane: Int64[np.ndarray, "J"], stop: Float[np.ndarray, "S J 2"]
 ) -> tuple[Float[np.ndarray, "S J 2"], Float[np.ndarray, "S J 2"]]:
     """Start and direction of the segment of each signal's lane nearest to the stop point, by the lane rule."""
     start, direction = np.empty_like(stop), np.empty_like(stop)

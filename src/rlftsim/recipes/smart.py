@@ -7,12 +7,10 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from rlftsim.errors import ConfigError
-from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
-from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.config import (
@@ -84,17 +82,8 @@ class SmartRecipe(Recipe):
             ConfigError: More tokens than the policy can hold, or a separate head for each class.
         """
         assert isinstance(policy, SmartPolicy)
-        if vocabulary is not None and policy.config.head_per_class:
-            raise ConfigError(
-                "each class of this model has a head of its own, whose places other tokens cannot take: leave "
-                "--vocabulary out."
-            )
-        base_vocabulary = policy.vocabulary
-        further = self.new_policy(
-            base_vocabulary if vocabulary is None else align_vocabulary(vocabulary, base_vocabulary, keep=keep)
-        )
-        load_strictly(further, policy.state_dict(), source="the model to train further")
-        return further
+        torch.manual_seed(self.pretrain.seed)  # as for a new policy
+        return policy.with_settings(self.model, vocabulary, keep)
 
     def with_goals(self) -> "SmartRecipe":
         """The same recipe for goal-conditioned fine-tuning; CAT-K then chooses among all tokens, not among the

@@ -66,21 +66,12 @@ def check_no_top_k(sampling: Sampling) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class ConstantVelocityContext:
-    """State of every agent at the current step, map frame."""
+class State:
+    """Poses and velocities of running simulations [B, N, A], map frame; as a context at the current step [B, A]."""
 
-    position: Float[Tensor, "B A 2"]
-    heading: Float[Tensor, "B A"]
-    velocity: Float[Tensor, "B A 2"]
-
-
-@dataclass(frozen=True, eq=False)
-class ConstantVelocityState:
-    """Poses and velocities of running simulations, map frame."""
-
-    position: Float[Tensor, "B N A 2"]
-    heading: Float[Tensor, "B N A"]
-    velocity: Float[Tensor, "B N A 2"]
+    position: Float[Tensor, "*batch 2"]
+    heading: Float[Tensor, "*batch"]
+    velocity: Float[Tensor, "*batch 2"]
     poses: Float[Tensor, "B N A 1 3"] | None = None
     draws: Tensor | None = None
 
@@ -100,14 +91,12 @@ class ConstantVelocity:
     def __repr__(self) -> str:
         return "ConstantVelocity()"
 
-    def encode(self, scenarios: ScenarioBatch) -> ConstantVelocityContext:
+    def encode(self, scenarios: ScenarioBatch) -> State:
         """States at the current step."""
         states = (scenarios.position, scenarios.heading, scenarios.velocity)
-        return ConstantVelocityContext(*(values[:, :, CURRENT_STEP] for values in states))
+        return State(*(values[:, :, CURRENT_STEP] for values in states))
 
-    def begin(
-        self, context: ConstantVelocityContext, num_rollouts: int, goals: Goals | None, noise: Tensor
-    ) -> ConstantVelocityState:
+    def begin(self, context: State, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current state, N times.
 
         Args:
@@ -117,9 +106,9 @@ class ConstantVelocity:
             noise: Noise [B, N, A, 0], empty since no numbers are drawn.
         """
         states = (context.position, context.heading, context.velocity)
-        return ConstantVelocityState(*(v[:, None].expand(-1, num_rollouts, *v.shape[1:]) for v in states))
+        return State(*(v[:, None].expand(-1, num_rollouts, *v.shape[1:]) for v in states))
 
-    def decide(self, context: ConstantVelocityContext, state: ConstantVelocityState) -> PointMass:
+    def decide(self, context: State, state: State) -> PointMass:
         """Distributions [B, N, A] with all mass on the present velocity.
 
         Args:
@@ -129,12 +118,8 @@ class ConstantVelocity:
         return PointMass(state.velocity)
 
     def advance(
-        self,
-        context: ConstantVelocityContext,
-        state: ConstantVelocityState,
-        decision: Float[Tensor, "B N A 2"],
-        forced: AgentStates | None = None,
-    ) -> ConstantVelocityState:
+        self, context: State, state: State, decision: Float[Tensor, "B N A 2"], forced: AgentStates | None = None
+    ) -> State:
         """State after 0.1 s at the chosen velocity; the heading stays.
 
         Args:
@@ -149,9 +134,9 @@ class ConstantVelocity:
             position = torch.where(imposed[..., None], forced.position[..., 0, :], position)
             heading = torch.where(imposed, forced.heading[..., 0], heading)
         poses = torch.cat([position, heading[..., None]], -1)[..., None, :]
-        return ConstantVelocityState(position, heading, state.velocity, poses, state.draws)
+        return State(position, heading, state.velocity, poses, state.draws)
 
-    def score(self, context: ConstantVelocityContext, rollouts: Rollouts) -> PointMass:
+    def score(self, context: State, rollouts: Rollouts) -> PointMass:
         """Distributions [B, N, A, L]: the same velocity at every decision.
 
         Args:

@@ -21,14 +21,7 @@ from torch import Tensor, nn
 from rlftsim.errors import RlftsimError, locate_error
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
-from rlftsim.rollout.edge_scenes import (
-    EXACT_TURN_RAD,
-    GRID_M,
-    edge_scenes,
-    move_scenario,
-    place_on_grid,
-    without_future,
-)
+from rlftsim.rollout import edge_scenes
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import (
     DecisionDistribution,
@@ -66,7 +59,7 @@ class CheckResult:
     """Outcome of one rule of the contract."""
 
     rule: str
-    """Name of the rule's function in this file, with spaces."""
+    """Name of the method of `Rules`, with spaces."""
     outcome: Outcome
     detail: str
     """The measurement, or the reason for which the rule does not apply."""
@@ -120,12 +113,12 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
     Returns:
         A result per rule. A rule with an error in the check counts as failed, with the error as detail.
     """
-    subject = _Subject(_copy_for_evaluation(policy), tuple(scenarios), reference)
+    rules = Rules(_copy_for_evaluation(policy), tuple(scenarios), reference)
     results = []
     for check in CHECKS:
         outcome: Outcome = "passed"
         try:
-            detail = check(subject)
+            detail = check(rules)
         except _NotApplicable as error:
             outcome, detail = "not applicable", str(error)
         except _Broken as error:
@@ -241,10 +234,6 @@ class _Subject:
         return torch.where(rollouts.decision_mask, scored, 0.0)
 
 
-Check = Callable[[_Subject], str]
-"""A rule: a function that returns its measurement as a text, or raises `_Broken` or `_NotApplicable`."""
-
-
 def _check_limit(measured: float, allowed: float, title: str = "largest gap") -> str:
     """Text of a measurement, or `_Broken` with the text."""
     text = f"{title} {measured:.2g}, allowed {allowed:g}"
@@ -265,11 +254,6 @@ def _check_gap(a: Tensor, b: Tensor, allowed: float, title: str = "largest gap")
     return _check_limit(_compute_gap(a, b), allowed, title)
 
 
-def _check_scores(subject: _Subject, rollouts: Rollouts) -> str:
-    """Text of the largest difference between scored and sampled log-probabilities, or `_Broken` with the text."""
-    return _check_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
-
-
 def _check_worst(gaps: dict[str, float], allowed: float, title: str) -> str:
     """Text of the largest of named gaps, or `_Broken` with the text."""
     worst = max(gaps, key=lambda name: gaps[name])
@@ -288,7 +272,7 @@ def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], A
         # constant speed along a chord of the arc
         offset = rotate(velocity[:, :, None] * time[:, None], (turn / 2).expand(*heading.shape, stride))
         # On the grid of `place_on_grid`, so that these poses can be turned without rounding.
-        path = ((position[:, :, None] + offset) / GRID_M).round() * GRID_M
+        path = ((position[:, :, None] + offset) / edge_scenes.GRID_M).round() * edge_scenes.GRID_M
         led = batch.agent_mask & ((index == 0) | ((index % 3 == 1) & (step < 20)))
         shape = (-1, NUM_ROLLOUTS, -1, stride)
         return AgentStates(
@@ -298,337 +282,6 @@ def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], A
         )
 
     return force
-
-
-# ---- rules: scores
-# ------------------------------------------------------------------------------------------------------
-
-
-def scored_log_probs_equal_sampled_ones(subject: _Subject) -> str:
-    """Scored log-probabilities equal sampled log-probabilities."""
-    return _check_scores(subject, subject.rollouts)
-
-
-def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) -> str:
-    """Scored log-probabilities equal sampled log-probabilities where agents are forced for a while."""
-    rollouts = subject.with_forced
-    assert rollouts.forced is not None
-    offset = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
-    _check_limit(float(offset.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
-    return _check_scores(subject, rollouts)
-
-
-def scored_log_probs_equal_sampled_ones_with_goals(subject: _Subject) -> str:
-    """Scored log-probabilities equal sampled log-probabilities where agents have goals."""
-    return _check_scores(subject, subject.with_goals)
-
-
-def empty_goals_equal_no_goals(subject: _Subject) -> str:
-    """Goals that no agent has (mask False, position NaN) change neither rollouts nor scores."""
-    position = torch.full_like(subject.batch.position[:, :, CURRENT_STEP], math.nan)
-    empty = Goals.of_scenarios(position, torch.zeros_like(subject.batch.agent_mask))
-    rollouts = subject.simulate(subject.batch, goals=empty)
-    _check_gap(rollouts.position, subject.rollouts.position, 0.0, "rollouts apart (m)")
-    return _check_scores(subject, rollouts)
-
-
-def scores_of_slices_equal_slices_of_scores(subject: _Subject) -> str:
-    """Scores do not depend on which rollouts are scored together."""
-    gaps = []
-    for rollouts in (subject.rollouts, subject.with_forced, subject.with_goals):
-        scored = subject.log_prob(subject.batch, rollouts)
-        for selected in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
-            gaps.append(_compute_gap(subject.log_prob(subject.batch, rollouts.select(selected)), scored[:, selected]))
-    return _check_limit(max(gaps), SCORE_TOLERANCE)
-
-
-# ---- rules: the distribution
-# -----------------------------------------------------------------------------------------------
-
-
-def kl_from_itself_is_zero(subject: _Subject) -> str:
-    """The KL divergence of a policy from itself is 0."""
-    scored = subject.score(subject.batch, subject.rollouts)
-    return _check_limit(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
-
-
-def kl_from_another_policy_is_positive(subject: _Subject) -> str:
-    """The KL divergence from a second policy is not negative, and somewhere positive."""
-    reference = subject.reference
-    scored = subject.score(subject.batch, subject.rollouts)
-    kl = scored.kl(subject.score(subject.batch, subject.rollouts, reference)).detach()
-    if subject.is_random and not float(kl.max()) > 0:
-        raise _Broken("the KL from another policy is 0 everywhere")
-    return _check_limit(-float(kl.min()), 1e-6, "most negative KL: minus")
-
-
-def padding_has_zero_log_prob_kl_and_entropy(subject: _Subject) -> str:
-    """Padding has log-probability, KL and entropy of exactly 0."""
-    width = subject.batch.agent_mask.shape[1] + 2
-    batch = subject.collate(subject.scenarios, max_agents=width)
-    rollouts = subject.simulate(batch)
-    scored = subject.score(batch, rollouts)
-    # two more agents than there are: even the largest scenario has padding
-    padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
-    values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
-    return _check_limit(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
-
-
-def entropy_matches_monte_carlo(subject: _Subject) -> str:
-    """The entropy is the mean of minus the log-probability of draws."""
-    draws = _draw_decisions(subject)
-    return _check_means(-draws.log_prob, draws.distribution.entropy()[0], draws.mask)
-
-
-def kl_matches_monte_carlo(subject: _Subject) -> str:
-    """The KL divergence from a second policy is the mean log-ratio of draws."""
-    draws = _draw_decisions(subject)
-    reference = _decide_first(subject, subject.reference)
-    # KL(p || q) is the mean of log p - log q over draws from p
-    ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(draws.log_prob, draws.decisions)])
-    return _check_means(ratio, draws.distribution.kl(reference)[0], draws.mask)
-
-
-def probabilities_sum_to_one(subject: _Subject) -> str:
-    """Probabilities add up to 1 (as importance weights of draws at temperature 1.5)."""
-    draws = _draw_decisions(subject, Sampling(temperature=1.5))
-    # the mean of p / p_warm over draws from p_warm is the sum of p over all decisions that p_warm can draw
-    log_p = torch.stack([draws.distribution.log_prob(d)[0] for d in draws.decisions])
-    weight = (log_p - draws.log_prob).exp()
-    return _check_means(weight, torch.ones_like(weight[0]), draws.mask)
-
-
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """Many draws of the first decision of the smallest scenario."""
-
-    distribution: DecisionDistribution
-    """[1, N, A]."""
-    decisions: list[Tensor]
-    log_prob: Tensor
-    """[K, N, A], under the distribution that was drawn from."""
-    mask: Tensor
-    """[A], True = a simulated agent."""
-
-
-def _decide_first(subject: _Subject, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
-    """Distributions of the first decision in the smallest scenario, for N equal rollouts [1, N, A]."""
-    batch = subject.smallest_batch
-    shape = (1, num_rollouts, batch.agent_mask.shape[1], policy.initial_noise_size)
-    noise = torch.full(shape, 0.5, device=batch.device)
-    with torch.no_grad():
-        context = policy.encode(batch)
-        return policy.decide(context, policy.begin(context, num_rollouts, None, noise))
-
-
-def _draw_decisions(subject: _Subject, sampling: Sampling = Sampling()) -> _Draws:  # noqa: B008
-    if not subject.is_random:
-        raise _NotApplicable("decisions are deterministic (noise_size is 0)")
-    distribution = _decide_first(subject, subject.policy)
-    mask = subject.smallest_batch.agent_mask[0]
-    generator = torch.Generator().manual_seed(0)
-    decisions = []
-    for _ in range(MONTE_CARLO_DRAWS // 64):
-        noise = torch.rand(1, 64, len(mask), subject.policy.noise_size, generator=generator).to(mask.device)
-        decisions.append(distribution.sample(sampling, noise))
-    log_prob = torch.stack([distribution.log_prob(d, sampling)[0] for d in decisions])
-    return _Draws(distribution, decisions, log_prob, mask)
-
-
-def _check_means(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
-    """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A], or `_Broken` with the text."""
-    # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
-    flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
-    error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
-    gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
-    return _check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
-
-
-# ---- rules: sampling and kinematics
-# -------------------------------------------------------------------------------------
-
-
-def temperature_zero_is_deterministic(subject: _Subject) -> str:
-    """At temperature 0 every rollout is the same, twice, up to the draws made once per rollout."""
-    first, second = (subject.simulate(subject.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
-    if not subject.policy.initial_noise_size:
-        repeated = first.position[:, :1].expand_as(first.position)
-        _check_gap(first.position, repeated, POSE_TOLERANCE_M, "rollouts apart (m)")
-    return _check_gap(first.position, second.position, 0.0, "runs apart (m)")
-
-
-def same_seed_gives_same_rollouts(subject: _Subject) -> str:
-    """The same seed gives the same rollouts, whole or in slices."""
-    repeated = subject.simulate(subject.batch)
-    _check_gap(repeated.position, subject.rollouts.position, 0.0, "runs apart (m)")
-    last = subject.simulate(subject.batch, range(1, NUM_ROLLOUTS))
-    return _check_gap(last.position, subject.rollouts.position[:, 1:], POSE_TOLERANCE_M, "slices apart (m)")
-
-
-def top_k_truncates_or_is_refused(subject: _Subject) -> str:
-    """Top-k keeps the most likely decisions, or is refused where there are no categories."""
-    if subject.rollouts.decision.is_floating_point():
-        try:
-            subject.simulate(subject.batch, sampling=Sampling(top_k=3))
-        except RlftsimError as error:
-            return f"refused: {error}"
-        raise _Broken("decisions are not categorical, and yet top_k=3 is accepted")
-    # top-1 is the mode; and log-probabilities are those of the truncated, renormalized distribution
-    greedy = subject.simulate(subject.batch, sampling=Sampling(temperature=0.0))
-    first = subject.simulate(subject.batch, sampling=Sampling(top_k=1))
-    _check_gap(first.position, greedy.position, POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
-    truncated = subject.simulate(subject.batch, sampling=Sampling(top_k=3))
-    scored = subject.score(subject.batch, truncated).log_prob(truncated.decision, Sampling(top_k=3))
-    scored = torch.where(truncated.decision_mask, scored, 0.0)
-    return _check_gap(scored, truncated.log_prob, SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
-
-
-def replayed_decisions_give_same_poses(subject: _Subject) -> str:
-    """Replaying decisions through `advance` gives the same poses, bit for bit."""
-    gaps = [_measure_replay_gap(subject, rollouts) for rollouts in (subject.rollouts, subject.with_forced)]
-    return _check_limit(max(gaps), 0.0, "largest gap (m, rad)")
-
-
-def _measure_replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
-    policy, stride = subject.policy, subject.policy.steps_per_decision
-    # The numbers that `simulate` gave to `begin`. Those of the decisions are not needed: the decisions are known.
-    ids = range(rollouts.num_rollouts)
-    size = policy.initial_noise_size
-    noise = draw_noise(subject.batch, ids, seed=SEED, purpose="begin", per_agent=size)  # [B, N, A, size]
-    poses = []
-    with torch.no_grad():
-        context = policy.encode(subject.batch)
-        state = policy.begin(context, rollouts.num_rollouts, rollouts.goals, noise)
-        for index in range(FUTURE_STEPS // stride):
-            forced = rollouts.forced and rollouts.forced.steps(index * stride, (index + 1) * stride)
-            state = policy.advance(context, state, rollouts.decision[:, :, :, index], forced)
-            poses.append(state.poses)
-    path = torch.cat(poses, 3)
-    return max(_compute_gap(path[..., :2], rollouts.position), _compute_gap(path[..., 2], rollouts.heading))
-
-
-# ---- rules: gradients
-# ------------------------------------------------------------------------------------------------------
-
-
-def gradients_reach_all_trained_weights(subject: _Subject) -> str:
-    """Gradients of the score reach the trained weights and no frozen weights, and are finite."""
-    weights = _back_propagate(subject, scale=1.0)
-    gradients = {name: p.grad for name, p in weights.items() if p.grad is not None}
-    # a gradient may be zero (no light in these scenarios), but never absent
-    trained = [name for name, p in weights.items() if p.requires_grad]
-    missing = [name for name in trained if name not in gradients]
-    strays = [name for name in gradients if not weights[name].requires_grad]
-    broken = [name for name, gradient in gradients.items() if not gradient.isfinite().all()]
-    if missing or strays or broken:
-        raise _Broken(f"not reached: {missing}; reached though not trained: {strays}; not finite: {broken}")
-    flat = [name for name, gradient in gradients.items() if not gradient.any()]
-    return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
-
-
-def zero_reward_gives_zero_gradient(subject: _Subject) -> str:
-    """With a reward of 0 the policy gradient is exactly 0."""
-    gradients = [weight.grad for weight in _back_propagate(subject, scale=0.0).values() if weight.grad is not None]
-    largest = max(_compute_gap(gradient, torch.zeros_like(gradient)) for gradient in gradients)
-    return _check_limit(largest, 0.0, "largest gradient")
-
-
-def _back_propagate(subject: _Subject, *, scale: float) -> dict[str, nn.Parameter]:
-    """Weights with gradients of a policy-gradient loss, with rewards of `scale` times 1, 2, ... by rollout."""
-    module = copy.deepcopy(subject.module)
-    if not any(weight.requires_grad for weight in module.parameters()):
-        raise _NotApplicable("no weight is trained")
-    assert isinstance(module, Policy)
-    module.zero_grad(set_to_none=True)
-    rollouts = subject.with_goals  # so that weights for goals take part
-    scored = module.score(module.encode(subject.batch), rollouts).log_prob(rollouts.decision)
-    reward = scale * torch.arange(1.0, NUM_ROLLOUTS + 1, device=scored.device)[None, :, None, None]
-    (-reward * torch.where(rollouts.decision_mask, scored, 0.0)).sum().backward()
-    return dict(module.named_parameters())
-
-
-def freezing_weights_changes_no_score(subject: _Subject) -> str:
-    """Freezing the weights changes no score."""
-    policies = [subject.copy_module(is_trained) for is_trained in (False, True)]
-    frozen, trained = (subject.log_prob(subject.batch, subject.rollouts, policy) for policy in policies)
-    return _check_gap(frozen, trained, SCORE_TOLERANCE)
-
-
-def shared_passes_change_no_number(subject: _Subject) -> str:
-    """Passes that share features, and statistics in one pass, give the numbers of separate passes."""
-    frozen = subject.copy_module(is_trained=False)
-    twin, gaps = copy.deepcopy(frozen), []
-    for rollouts in (subject.rollouts, subject.with_goals):
-        expected, decision = subject.score(subject.batch, rollouts, frozen), rollouts.decision
-        for reference in (twin, subject.reference):
-            with torch.no_grad():
-                context = frozen.encode(subject.batch)
-                contexts = [encode_like(policy, subject.batch, context) for policy in (frozen, reference)]
-                dist, ref_dist = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
-                statistics = compute_statistics(dist, decision, ref_dist)
-            kl = expected.kl(subject.score(subject.batch, rollouts, reference))
-            gaps += [_compute_gap(statistics.log_prob, expected.log_prob(decision)), _compute_gap(statistics.kl, kl)]
-            gaps.append(_compute_gap(statistics.entropy, expected.entropy()))
-    return _check_limit(max(gaps), SCORE_TOLERANCE)
-
-
-# ---- rules: scenarios
-# ---------------------------------------------------------------------------------------------------
-
-
-def scores_are_invariant_to_rotation_and_translation(subject: _Subject) -> str:
-    """Scenarios and rollouts turned and shifted together have the same scores."""
-    gaps = {}
-    # on a grid that stays exact under the turns below: gaps are then the policy's rounding
-    still = replace(subject, scenarios=tuple(place_on_grid(s) for s in subject.scenarios))
-    turns = (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 53.13 degrees", EXACT_TURN_RAD))
-    for name, turn in turns:
-        moved = [move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
-        batch = subject.collate(moved)
-        # origins of map frames lie on whole meters, so no origin follows a scenario exactly
-        origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
-        offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(get_device(subject.policy))  # [B, 2]
-        for rollouts in (still.rollouts, still.with_forced, still.with_goals):
-            scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
-            gaps[name] = max(gaps.get(name, 0.0), _compute_gap(scored, subject.log_prob(still.batch, rollouts)))
-    return _check_worst(gaps, SCORE_TOLERANCE + subject.rounding, "largest gap")
-
-
-def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
-    """A scenario alone has the same scores as in a batch with a larger scenario, and the same rollouts."""
-    batch, gaps, distances = subject.batch, [], []
-    if len(subject.scenarios) < 2:
-        raise _NotApplicable("a single scenario was handed over")
-    # a policy that draws once per rollout gets as many agents as in the batch: its draws have that shape
-    scored = subject.log_prob(batch, subject.rollouts)
-    for b, scenario in enumerate(subject.scenarios):
-        count = batch.agent_mask.shape[1] if subject.rollouts.draws is not None else len(scenario.simulated_indices)
-        single = subject.collate([scenario], max_agents=count)
-        rollouts = _select_scenario(subject.rollouts, b, count)
-        gaps.append(_compute_gap(subject.log_prob(single, rollouts), scored[b : b + 1, :, :count]))
-        distances.append(_compute_gap(subject.simulate(single).position, rollouts.position))
-    _check_limit(max(distances), POSE_TOLERANCE_M, "rollouts apart (m)")
-    return _check_limit(max(gaps), PADDING_TOLERANCE + subject.rounding)
-
-
-def rollouts_do_not_depend_on_the_logged_future(subject: _Subject) -> str:
-    """The rollouts are the same where tracks and lights end at the current step, as in a test split."""
-    if not all(scenario.has_future for scenario in subject.scenarios):
-        raise _NotApplicable("a scenario has no logged future")
-    batch = subject.collate([without_future(scenario) for scenario in subject.scenarios])
-    return _check_gap(subject.simulate(batch).position, subject.rollouts.position, POSE_TOLERANCE_M, "apart (m)")
-
-
-def edge_cases_can_be_simulated_and_scored(subject: _Subject) -> str:
-    """Simulations and scores succeed: one agent, no map, no lights, 128 agents, agents first seen now or never, NaN."""
-    gaps = {}
-    for name, scenario in edge_scenes(subject.scenarios[0]).items():
-        batch = subject.collate([scenario])
-        rollouts = subject.simulate(batch)
-        if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):
-            raise _Broken(f"{name}: poses are not finite")
-        gaps[name] = _compute_gap(subject.log_prob(batch, rollouts), rollouts.log_prob)
-    return _check_worst(gaps, SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap")
 
 
 def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
@@ -656,28 +309,306 @@ def _select_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
     return replace(rollouts, **values, draws=None if rollouts.draws is None else rollouts.draws[b : b + 1])
 
 
-CHECKS: tuple[Check, ...] = (
-    scored_log_probs_equal_sampled_ones,
-    scored_log_probs_equal_sampled_ones_with_forced_agents,
-    scored_log_probs_equal_sampled_ones_with_goals,
-    empty_goals_equal_no_goals,
-    scores_of_slices_equal_slices_of_scores,
-    kl_from_itself_is_zero,
-    kl_from_another_policy_is_positive,
-    padding_has_zero_log_prob_kl_and_entropy,
-    entropy_matches_monte_carlo,
-    kl_matches_monte_carlo,
-    probabilities_sum_to_one,
-    temperature_zero_is_deterministic,
-    same_seed_gives_same_rollouts,
-    top_k_truncates_or_is_refused,
-    replayed_decisions_give_same_poses,
-    gradients_reach_all_trained_weights,
-    zero_reward_gives_zero_gradient,
-    freezing_weights_changes_no_score,
-    shared_passes_change_no_number,
-    scores_are_invariant_to_rotation_and_translation,
-    rollouts_are_independent_of_batch_composition,
-    rollouts_do_not_depend_on_the_logged_future,
-    edge_cases_can_be_simulated_and_scored,
-)
+class Rules(_Subject):
+    """The contract: a public method for each rule.
+
+    A rule returns the measurement as a text, or raises `_Broken` or `_NotApplicable`.
+    """
+
+    def _check_scores(self, rollouts: Rollouts) -> str:
+        """Text of the largest difference between scored and sampled log-probabilities, or `_Broken` with the text."""
+        return _check_gap(self.log_prob(self.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
+
+    # ---- rules: scores ----------------------------------------------------------------------------------------------
+
+    def scored_log_probs_equal_sampled_ones(self) -> str:
+        """Scored log-probabilities equal sampled log-probabilities."""
+        return self._check_scores(self.rollouts)
+
+    def scored_log_probs_equal_sampled_ones_with_forced_agents(self) -> str:
+        """Scored log-probabilities equal sampled log-probabilities where agents are forced for a while."""
+        rollouts = self.with_forced
+        assert rollouts.forced is not None
+        offset = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
+        _check_limit(float(offset.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
+        return self._check_scores(rollouts)
+
+    def scored_log_probs_equal_sampled_ones_with_goals(self) -> str:
+        """Scored log-probabilities equal sampled log-probabilities where agents have goals."""
+        return self._check_scores(self.with_goals)
+
+    def empty_goals_equal_no_goals(self) -> str:
+        """Goals that no agent has (mask False, position NaN) change neither rollouts nor scores."""
+        position = torch.full_like(self.batch.position[:, :, CURRENT_STEP], math.nan)
+        empty = Goals.of_scenarios(position, torch.zeros_like(self.batch.agent_mask))
+        rollouts = self.simulate(self.batch, goals=empty)
+        _check_gap(rollouts.position, self.rollouts.position, 0.0, "rollouts apart (m)")
+        return self._check_scores(rollouts)
+
+    def scores_of_slices_equal_slices_of_scores(self) -> str:
+        """Scores do not depend on which rollouts are scored together."""
+        gaps = []
+        for rollouts in (self.rollouts, self.with_forced, self.with_goals):
+            scored = self.log_prob(self.batch, rollouts)
+            for selected in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
+                gaps.append(_compute_gap(self.log_prob(self.batch, rollouts.select(selected)), scored[:, selected]))
+        return _check_limit(max(gaps), SCORE_TOLERANCE)
+
+    # ---- rules: the distribution ------------------------------------------------------------------------------------
+
+    def kl_from_itself_is_zero(self) -> str:
+        """The KL divergence of a policy from itself is 0."""
+        scored = self.score(self.batch, self.rollouts)
+        return _check_limit(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
+
+    def kl_from_another_policy_is_positive(self) -> str:
+        """The KL divergence from a second policy is not negative, and somewhere positive."""
+        reference = self.reference
+        scored = self.score(self.batch, self.rollouts)
+        kl = scored.kl(self.score(self.batch, self.rollouts, reference)).detach()
+        if self.is_random and not float(kl.max()) > 0:
+            raise _Broken("the KL from another policy is 0 everywhere")
+        return _check_limit(-float(kl.min()), 1e-6, "most negative KL: minus")
+
+    def padding_has_zero_log_prob_kl_and_entropy(self) -> str:
+        """Padding has log-probability, KL and entropy of exactly 0."""
+        width = self.batch.agent_mask.shape[1] + 2
+        batch = self.collate(self.scenarios, max_agents=width)
+        rollouts = self.simulate(batch)
+        scored = self.score(batch, rollouts)
+        # two more agents than there are: even the largest scenario has padding
+        padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
+        values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
+        return _check_limit(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
+
+    def entropy_matches_monte_carlo(self) -> str:
+        """The entropy is the mean of minus the log-probability of draws."""
+        distribution, _, log_prob = self._draw_decisions()
+        return self._check_means(-log_prob, distribution.entropy()[0])
+
+    def kl_matches_monte_carlo(self) -> str:
+        """The KL divergence from a second policy is the mean log-ratio of draws."""
+        distribution, decisions, log_prob = self._draw_decisions()
+        reference = self._decide_first(self.reference)
+        # KL(p || q) is the mean of log p - log q over draws from p
+        ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(log_prob, decisions)])
+        return self._check_means(ratio, distribution.kl(reference)[0])
+
+    def probabilities_sum_to_one(self) -> str:
+        """Probabilities add up to 1 (as importance weights of draws at temperature 1.5)."""
+        distribution, decisions, log_prob = self._draw_decisions(temperature=1.5)
+        # the mean of p / p_warm over draws from p_warm is the sum of p over all decisions that p_warm can draw
+        log_p = torch.stack([distribution.log_prob(d)[0] for d in decisions])
+        weight = (log_p - log_prob).exp()
+        return self._check_means(weight, torch.ones_like(weight[0]))
+
+    def _decide_first(self, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
+        """Distributions of the first decision in the smallest scenario, for N equal rollouts [1, N, A]."""
+        batch = self.smallest_batch
+        shape = (1, num_rollouts, batch.agent_mask.shape[1], policy.initial_noise_size)
+        noise = torch.full(shape, 0.5, device=batch.device)
+        with torch.no_grad():
+            context = policy.encode(batch)
+            return policy.decide(context, policy.begin(context, num_rollouts, None, noise))
+
+    def _check_means(self, draws: Tensor, expected: Tensor) -> str:
+        """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A], or `_Broken` with the text."""
+        # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
+        mask = self.smallest_batch.agent_mask[0]
+        flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
+        error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
+        gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
+        return _check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
+
+    def _draw_decisions(self, temperature: float = 1.0) -> tuple[DecisionDistribution, list[Tensor], Tensor]:
+        """Many draws of the first decision of the smallest scenario.
+
+        Args:
+            temperature: Temperature of the draws; 1 draws from the untempered distribution.
+
+        Returns:
+            Distribution [1, N, A], K draws of it, and their log-probabilities [K, N, A] under the distribution that
+            was drawn from.
+        """
+        if not self.is_random:
+            raise _NotApplicable("decisions are deterministic (noise_size is 0)")
+        distribution, sampling = self._decide_first(self.policy), Sampling(temperature=temperature)
+        mask = self.smallest_batch.agent_mask[0]
+        generator = torch.Generator().manual_seed(0)
+        decisions = []
+        for _ in range(MONTE_CARLO_DRAWS // 64):
+            noise = torch.rand(1, 64, len(mask), self.policy.noise_size, generator=generator).to(mask.device)
+            decisions.append(distribution.sample(sampling, noise))
+        log_prob = torch.stack([distribution.log_prob(d, sampling)[0] for d in decisions])
+        return distribution, decisions, log_prob
+
+    # ---- rules: sampling and kinematics -----------------------------------------------------------------------------
+
+    def temperature_zero_is_deterministic(self) -> str:
+        """At temperature 0 every rollout is the same, twice, up to the draws made once per rollout."""
+        first, second = (self.simulate(self.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
+        if not self.policy.initial_noise_size:
+            repeated = first.position[:, :1].expand_as(first.position)
+            _check_gap(first.position, repeated, POSE_TOLERANCE_M, "rollouts apart (m)")
+        return _check_gap(first.position, second.position, 0.0, "runs apart (m)")
+
+    def same_seed_gives_same_rollouts(self) -> str:
+        """The same seed gives the same rollouts, whole or in slices."""
+        repeated = self.simulate(self.batch)
+        _check_gap(repeated.position, self.rollouts.position, 0.0, "runs apart (m)")
+        last = self.simulate(self.batch, range(1, NUM_ROLLOUTS))
+        return _check_gap(last.position, self.rollouts.position[:, 1:], POSE_TOLERANCE_M, "slices apart (m)")
+
+    def top_k_truncates_or_is_refused(self) -> str:
+        """Top-k keeps the most likely decisions, or is refused where there are no categories."""
+        if self.rollouts.decision.is_floating_point():
+            try:
+                self.simulate(self.batch, sampling=Sampling(top_k=3))
+            except RlftsimError as error:
+                return f"refused: {error}"
+            raise _Broken("decisions are not categorical, and yet top_k=3 is accepted")
+        # top-1 is the mode; and log-probabilities are those of the truncated, renormalized distribution
+        greedy = self.simulate(self.batch, sampling=Sampling(temperature=0.0))
+        first = self.simulate(self.batch, sampling=Sampling(top_k=1))
+        _check_gap(first.position, greedy.position, POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
+        truncated = self.simulate(self.batch, sampling=Sampling(top_k=3))
+        scored = self.score(self.batch, truncated).log_prob(truncated.decision, Sampling(top_k=3))
+        scored = torch.where(truncated.decision_mask, scored, 0.0)
+        return _check_gap(scored, truncated.log_prob, SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
+
+    def replayed_decisions_give_same_poses(self) -> str:
+        """Replaying decisions through `advance` gives the same poses, bit for bit."""
+        gaps = [self._measure_replay_gap(rollouts) for rollouts in (self.rollouts, self.with_forced)]
+        return _check_limit(max(gaps), 0.0, "largest gap (m, rad)")
+
+    def _measure_replay_gap(self, rollouts: Rollouts) -> float:
+        policy, stride = self.policy, self.policy.steps_per_decision
+        # The numbers that `simulate` gave to `begin`. Those of the decisions are not needed: the decisions are known.
+        ids = range(rollouts.num_rollouts)
+        size = policy.initial_noise_size
+        noise = draw_noise(self.batch, ids, seed=SEED, purpose="begin", per_agent=size)  # [B, N, A, size]
+        poses = []
+        with torch.no_grad():
+            context = policy.encode(self.batch)
+            state = policy.begin(context, rollouts.num_rollouts, rollouts.goals, noise)
+            for index in range(FUTURE_STEPS // stride):
+                forced = rollouts.forced and rollouts.forced.steps(index * stride, (index + 1) * stride)
+                state = policy.advance(context, state, rollouts.decision[:, :, :, index], forced)
+                poses.append(state.poses)
+        path = torch.cat(poses, 3)
+        return max(_compute_gap(path[..., :2], rollouts.position), _compute_gap(path[..., 2], rollouts.heading))
+
+    # ---- rules: gradients -------------------------------------------------------------------------------------------
+
+    def gradients_reach_all_trained_weights(self) -> str:
+        """Gradients of the score reach the trained weights and no frozen weights, and are finite."""
+        weights = self._back_propagate(scale=1.0)
+        gradients = {name: p.grad for name, p in weights.items() if p.grad is not None}
+        # a gradient may be zero (no light in these scenarios), but never absent
+        trained = [name for name, p in weights.items() if p.requires_grad]
+        missing = [name for name in trained if name not in gradients]
+        strays = [name for name in gradients if not weights[name].requires_grad]
+        broken = [name for name, gradient in gradients.items() if not gradient.isfinite().all()]
+        if missing or strays or broken:
+            raise _Broken(f"not reached: {missing}; reached though not trained: {strays}; not finite: {broken}")
+        flat = [name for name, gradient in gradients.items() if not gradient.any()]
+        return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
+
+    def zero_reward_gives_zero_gradient(self) -> str:
+        """With a reward of 0 the policy gradient is exactly 0."""
+        gradients = [weight.grad for weight in self._back_propagate(scale=0.0).values() if weight.grad is not None]
+        largest = max(_compute_gap(gradient, torch.zeros_like(gradient)) for gradient in gradients)
+        return _check_limit(largest, 0.0, "largest gradient")
+
+    def _back_propagate(self, *, scale: float) -> dict[str, nn.Parameter]:
+        """Weights with gradients of a policy-gradient loss, with rewards of `scale` times 1, 2, ... by rollout."""
+        module = copy.deepcopy(self.module)
+        if not any(weight.requires_grad for weight in module.parameters()):
+            raise _NotApplicable("no weight is trained")
+        assert isinstance(module, Policy)
+        module.zero_grad(set_to_none=True)
+        rollouts = self.with_goals  # so that weights for goals take part
+        scored = module.score(module.encode(self.batch), rollouts).log_prob(rollouts.decision)
+        reward = scale * torch.arange(1.0, NUM_ROLLOUTS + 1, device=scored.device)[None, :, None, None]
+        (-reward * torch.where(rollouts.decision_mask, scored, 0.0)).sum().backward()
+        return dict(module.named_parameters())
+
+    def freezing_weights_changes_no_score(self) -> str:
+        """Freezing the weights changes no score."""
+        policies = [self.copy_module(is_trained) for is_trained in (False, True)]
+        frozen, trained = (self.log_prob(self.batch, self.rollouts, policy) for policy in policies)
+        return _check_gap(frozen, trained, SCORE_TOLERANCE)
+
+    def shared_passes_change_no_number(self) -> str:
+        """Passes that share features, and statistics in one pass, give the numbers of separate passes."""
+        frozen = self.copy_module(is_trained=False)
+        twin, gaps = copy.deepcopy(frozen), []
+        for rollouts in (self.rollouts, self.with_goals):
+            expected, decision = self.score(self.batch, rollouts, frozen), rollouts.decision
+            for reference in (twin, self.reference):
+                with torch.no_grad():
+                    context = frozen.encode(self.batch)
+                    contexts = [encode_like(policy, self.batch, context) for policy in (frozen, reference)]
+                    dist, ref = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
+                    statistics = compute_statistics(dist, decision, ref)
+                kl = expected.kl(self.score(self.batch, rollouts, reference))
+                values = (expected.log_prob(decision), kl, expected.entropy())
+                gaps += map(_compute_gap, (statistics.log_prob, statistics.kl, statistics.entropy), values)
+        return _check_limit(max(gaps), SCORE_TOLERANCE)
+
+    # ---- rules: scenarios -------------------------------------------------------------------------------------------
+
+    def scores_are_invariant_to_rotation_and_translation(self) -> str:
+        """Scenarios and rollouts turned and shifted together have the same scores."""
+        gaps = {}
+        # on a grid that stays exact under the turns below: gaps are then the policy's rounding
+        still = replace(self, scenarios=tuple(edge_scenes.place_on_grid(s) for s in self.scenarios))
+        turns = {"shifted": 0.0, "turned by 90 degrees": math.pi / 2}
+        turns["turned by 53.13 degrees"] = edge_scenes.EXACT_TURN_RAD
+        for name, turn in turns.items():
+            moved = [edge_scenes.move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
+            batch = self.collate(moved)
+            # origins of map frames lie on whole meters, so no origin follows a scenario exactly
+            origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
+            offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(get_device(self.policy))  # [B, 2]
+            for rollouts in (still.rollouts, still.with_forced, still.with_goals):
+                scored = self.log_prob(batch, _move_rollouts(rollouts, turn, offset))
+                gaps[name] = max(gaps.get(name, 0.0), _compute_gap(scored, self.log_prob(still.batch, rollouts)))
+        return _check_worst(gaps, SCORE_TOLERANCE + self.rounding, "largest gap")
+
+    def rollouts_are_independent_of_batch_composition(self) -> str:
+        """A scenario alone has the same scores as in a batch with a larger scenario, and the same rollouts."""
+        batch, gaps, distances = self.batch, [], []
+        if len(self.scenarios) < 2:
+            raise _NotApplicable("a single scenario was handed over")
+        # a policy that draws once per rollout gets as many agents as in the batch: its draws have that shape
+        scored = self.log_prob(batch, self.rollouts)
+        for b, scenario in enumerate(self.scenarios):
+            count = batch.agent_mask.shape[1] if self.rollouts.draws is not None else len(scenario.simulated_indices)
+            single = self.collate([scenario], max_agents=count)
+            rollouts = _select_scenario(self.rollouts, b, count)
+            gaps.append(_compute_gap(self.log_prob(single, rollouts), scored[b : b + 1, :, :count]))
+            distances.append(_compute_gap(self.simulate(single).position, rollouts.position))
+        _check_limit(max(distances), POSE_TOLERANCE_M, "rollouts apart (m)")
+        return _check_limit(max(gaps), PADDING_TOLERANCE + self.rounding)
+
+    def rollouts_do_not_depend_on_the_logged_future(self) -> str:
+        """The rollouts are the same where tracks and lights end at the current step, as in a test split."""
+        if not all(scenario.has_future for scenario in self.scenarios):
+            raise _NotApplicable("a scenario has no logged future")
+        batch = self.collate([edge_scenes.without_future(scenario) for scenario in self.scenarios])
+        return _check_gap(self.simulate(batch).position, self.rollouts.position, POSE_TOLERANCE_M, "apart (m)")
+
+    def edge_cases_can_be_simulated_and_scored(self) -> str:
+        """Simulations and scores succeed: one agent, 128, no map, no lights, agents first seen now or never, NaN."""
+        gaps = {}
+        for name, scenario in edge_scenes.edge_scenes(self.scenarios[0]).items():
+            batch = self.collate([scenario])
+            rollouts = self.simulate(batch)
+            if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):
+                raise _Broken(f"{name}: poses are not finite")
+            gaps[name] = _compute_gap(self.log_prob(batch, rollouts), rollouts.log_prob)
+        return _check_worst(gaps, SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap")
+
+
+CHECKS = tuple(rule for name, rule in vars(Rules).items() if not name.startswith("_"))

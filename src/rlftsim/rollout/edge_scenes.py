@@ -38,12 +38,10 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
 
     heading = wrapped(scenario.tracks.heading.astype(np.float64) + turn_rad).astype(np.float32)
     velocity = (scenario.tracks.velocity.astype(np.float64) @ matrix[:2, :2].T).astype(np.float32)
-    return _transform_points(scenario, moved, heading=heading, velocity=velocity)
+    return _move_points(scenario, moved, heading=heading, velocity=velocity)
 
 
-def _transform_points(
-    scenario: Scenario, transform: Callable[[np.ndarray], np.ndarray], **tracks: np.ndarray
-) -> Scenario:
+def _move_points(scenario: Scenario, transform: Callable[[np.ndarray], np.ndarray], **tracks: np.ndarray) -> Scenario:
     """The scenario with all points transformed, and further fields of the tracks replaced."""
     features, lights = scenario.map_features, scenario.lights
     return replace(
@@ -56,15 +54,10 @@ def _transform_points(
 
 def without_future(scenario: Scenario) -> Scenario:
     """The same scenario as in a test split: tracks and lights end at the current step."""
-    tracks, lights, end = scenario.tracks, scenario.lights, CURRENT_STEP + 1
+    times, tracks, lights, end = scenario.timestamps_s, scenario.tracks, scenario.lights, CURRENT_STEP + 1
     cut = {name: getattr(tracks, name)[:, :end] for name in ("position", "heading", "velocity", "size", "valid")}
     history = {field.name: getattr(lights, field.name)[lights.step < end] for field in fields(lights)}
-    return replace(
-        scenario,
-        timestamps_s=scenario.timestamps_s[:end],
-        tracks=replace(tracks, **cut),
-        lights=LightStates(**history),
-    )
+    return replace(scenario, timestamps_s=times[:end], tracks=replace(tracks, **cut), lights=LightStates(**history))
 
 
 def place_on_grid(scenario: Scenario) -> Scenario:
@@ -79,7 +72,7 @@ def place_on_grid(scenario: Scenario) -> Scenario:
     def rounded(points: np.ndarray) -> np.ndarray:
         return (np.round(points / GRID_M) * GRID_M).astype(np.float32)
 
-    return _transform_points(central, rounded)
+    return _move_points(central, rounded)
 
 
 def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:

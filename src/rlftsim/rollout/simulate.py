@@ -21,20 +21,6 @@ Force = Callable[[Any, int], AgentStates | None]
 Observe = Callable[[Float[Tensor, "B N A t 3"]], None]
 
 
-def sample_decision(
-    distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Float[Tensor, "B N A k"]
-) -> Tensor:
-    """Draw a decision from the policy's distribution: the default of `simulate`.
-
-    Args:
-        distribution: Distributions [B, N, A] of the next decision.
-        state: State before the decision, not used here.
-        sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
-        noise: Uniform numbers in [0, 1), `Policy.noise_size` per agent.
-    """
-    return distribution.sample(sampling, noise)
-
-
 @one_thread()
 @torch.no_grad()
 def simulate(
@@ -46,7 +32,7 @@ def simulate(
     context: Any = None,
     goals: Goals | None = None,
     sampling: Sampling = Sampling(),  # noqa: B008
-    choose: Choose = sample_decision,
+    choose: Choose | None = None,
     force: Force | None = None,
     observe: Observe | None = None,
     may_be_nan: bool = False,
@@ -62,7 +48,7 @@ def simulate(
         context: Result of an earlier `policy.encode(batch)`; None = encode here.
         goals: Goals of agents in each of the N rollouts, or in a single rollout to be repeated; None = goal-free.
         sampling: Temperature and truncation of every draw.
-        choose: Function that picks decisions from a distribution, such as CAT-K's closest among the top K.
+        choose: Function that picks decisions from a distribution, such as CAT-K's closest among the top K; None = draw.
         force: Function called before every advance with the state and the step that the decision starts at; may impose
             states on agents.
         observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error ends
@@ -98,7 +84,8 @@ def simulate(
     poses, decisions, log_probs, forced_states, masks = [], [], [], [], []
     for step, decision_noise in zip(range(0, FUTURE_STEPS, stride), noise.unbind(-2)):
         distribution = policy.decide(context, state)
-        decision = choose(distribution, state, sampling, decision_noise)
+        arguments = (sampling, decision_noise)
+        decision = choose(distribution, state, *arguments) if choose else distribution.sample(*arguments)
         forced = force(state, step) if force else None
         state = policy.advance(context, state, decision, forced)
         poses.append(state.poses)

@@ -1,10 +1,15 @@
-"""Simulated futures (rollouts) of a batch of scenarios.
+"""Simulated futures (rollouts) of a batch of scenarios, in memory and as files.
+
+`write_rollouts` writes an npz per scenario, in the layout that `rlftsim score` and other tools read: scenario_id,
+object_ids [A] int64, x y z heading [N, A, 80] float32, world frame.
 
 Frame: map (centered, meters). N rollouts, L decisions, T simulated steps of 0.1 s. A policy's decisions have event
 axes `*event` (none for SMART's token ids, one of size 2 for two-dimensional actions).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,8 +19,9 @@ from torch import Tensor
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals, shown_id
-from rlftsim.scenario.batch import Frame, compute_origin
-from rlftsim.scenario.types import Scenario, render_html
+from rlftsim.jobs.files import write_atomically
+from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
+from rlftsim.scenario.types import CURRENT_STEP, Scenario, render_html
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +42,11 @@ class AgentStates:
             start: First step of 0.1 s, counted from 0 at the first simulated step.
             stop: Step after the last, on the same count.
         """
-        return AgentStates(
-            self.position[..., start:stop, :], self.heading[..., start:stop], self.valid[..., start:stop]
-        )
+        return AgentStates(*(values[:, :, :, start:stop] for values in vars(self).values()))
 
     def rollouts(self, selected: slice) -> "AgentStates":
         """The states of some of the rollouts."""
-        return AgentStates(self.position[:, selected], self.heading[:, selected], self.valid[:, selected])
+        return AgentStates(*(values[:, selected] for values in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,3 +207,32 @@ class Rollouts:
 
     def _repr_html_(self) -> str | None:
         return render_html(self)
+
+
+def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> list[Path]:
+    """Write each scenario's rollouts to `folder/<scenario id>.npz`, each file whole or not at all.
+
+    Args:
+        folder: Folder of the files, created where it is missing.
+        batch: Scenarios that the rollouts continue, in the same order, with ids, heights and the world frame.
+        rollouts: Simulated futures in the map frame. The height of an agent stays that of the current step.
+
+    Returns:
+        The files, in the order of the batch.
+    """
+    world = batch.to_world(rollouts.position).cpu().numpy()
+    headings, heights = rollouts.heading.float().cpu().numpy(), batch.z[:, :, CURRENT_STEP].cpu().numpy()
+    files = [folder / f"{scenario.scenario_id}.npz" for scenario in batch.scenarios]
+    for b, (file, scenario) in enumerate(zip(files, batch.scenarios)):
+        indices = scenario.simulated_indices
+        heading = headings[b, :, : len(indices)]  # [N, A, 80] without padding
+        x, y = (world[b, :, : len(indices), :, axis] for axis in range(2))
+        z = np.broadcast_to(heights[b, : len(indices), None], heading.shape)
+        ids = {"scenario_id": np.array(scenario.scenario_id), "object_ids": scenario.tracks.object_id[indices]}
+        write_atomically(file, partial(_write_npz, **ids, x=x, y=y, z=z, heading=heading))
+    return files
+
+
+def _write_npz(path: Path, **arrays: np.ndarray) -> None:
+    with path.open("wb") as file:  # by name, numpy would append .npz
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType] (numpy's stub)

@@ -20,7 +20,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
-from rlftsim.scenario.rows import INTEGERS, NOTES, NUMBERS, TRUTHS, WORDS, Rows, read_rows
+from rlftsim.scenario.rows import Rows, Schema, read_rows
 from rlftsim.scenario.source import BytesRead, Item, Tally, Unit
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
@@ -30,7 +30,6 @@ from rlftsim.scenario.types import (
     OTHER_SIZE_M,
     STEP_S,
     LightStates,
-    MapFeatures,
     ObjectType,
     Scenario,
     Tracks,
@@ -70,14 +69,14 @@ SIZES_M = {
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 FOCAL, SCORED = 3, 2
 _CUT_TRACKS = "tracks to predict not evaluated, as they leave the ground that the map covers"
-_NEEDED = (
-    dict.fromkeys(("track_id", "object_type", "scenario_id"), WORDS)
-    | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), NUMBERS)
-    | dict.fromkeys(("start_timestamp", "end_timestamp"), NUMBERS)
-    | dict.fromkeys(("object_category", "timestep", "num_timestamps"), INTEGERS)
-    | {"observed": TRUTHS}
+_SCHEMA: Schema = (
+    dict.fromkeys(("track_id", "object_type", "scenario_id"), "text")
+    | dict.fromkeys(("position_x", "position_y", "heading", "velocity_x", "velocity_y"), "numbers")
+    | dict.fromkeys(("start_timestamp", "end_timestamp"), "numbers")
+    | dict.fromkeys(("object_category", "timestep", "num_timestamps"), "whole numbers")
+    | {"observed": "True or False"},
+    dict.fromkeys(("city", "slice_id", "focal_track_id"), "text or nothing") | {"map_id": "numbers"},
 )
-_OPTIONAL = dict.fromkeys(("city", "slice_id", "focal_track_id"), NOTES) | {"map_id": NUMBERS}
 
 
 class Av2Source:
@@ -190,62 +189,46 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
         raise DataError(f"{file.name}: there is no {_find_map(file).name} beside it")
     map_features, ground = read_map(_find_map(file))
     windows = WINDOWS[source.window] if num_steps == RECORDED_STEPS else TEST_WINDOW
-    recording, category, ego = _read_tracks(rows, num_steps, source, ground)
+    recording, categories, ego = _read_tracks(rows, num_steps, source, ground)
     for first, end in windows:
         suffix = f"-{first}" if len(windows) > 1 else ""
-        scenario_id = f"{rows['scenario_id'][0]}{suffix}"
-        yield _cut_window(scenario_id, recording, category, ego, slice(first, end), map_features, ground)
-
-
-def _cut_window(
-    scenario_id: str,
-    recording: Tracks,
-    category: np.ndarray,
-    ego: int,
-    window: slice,
-    map_features: MapFeatures,
-    ground: Ground,
-) -> tuple[Scenario, int]:
-    """Scenario of some steps of a recording, see `read_scenario`."""
-    indices = np.flatnonzero(recording.valid[:, window].any(1))
-    tracks = recording.select(indices).cut(window)
-    category, ego_indices = category[indices], np.flatnonzero(indices == ego)
-    if not len(ego_indices) or not tracks.valid[ego_indices[0], CURRENT_STEP]:
-        raise DataError(f"the ego (track AV) is not there at the current step ({window.start + CURRENT_STEP})")
-    predicted, num_cut = [], 0
-    for track in np.flatnonzero((category >= SCORED) & tracks.valid[:, CURRENT_STEP]):
-        path = tracks.position[track, HISTORY_STEPS - 1 :][tracks.valid[track, HISTORY_STEPS - 1 :]]
-        is_cut = ground.leaves_through_cut(path[:, :2].astype(np.float64))
-        num_cut += is_cut
-        if not is_cut:
-            predicted.append(track)
-    scenario = Scenario(
-        scenario_id=scenario_id,
-        timestamps_s=np.round(np.arange(tracks.valid.shape[1]) * STEP_S, 1),
-        tracks=tracks,
-        map_features=map_features,
-        lights=LightStates.of([]),
-        ego_index=int(ego_indices[0]),
-        tracks_to_predict=np.array(predicted, np.int32),
-        difficulty=np.zeros(len(predicted), np.int8),
-        objects_of_interest=tracks.object_id[category == FOCAL],
-        source="av2",
-        guessed=frozenset(("size", "z")),
-    )
-    return scenario, num_cut
+        indices = np.flatnonzero(recording.valid[:, first:end].any(1))
+        tracks = recording.select(indices).cut(slice(first, end))
+        category, ego_indices = categories[indices], np.flatnonzero(indices == ego)
+        if not len(ego_indices) or not tracks.valid[ego_indices[0], CURRENT_STEP]:
+            raise DataError(f"the ego (track AV) is not there at the current step ({first + CURRENT_STEP})")
+        predicted, num_cut = [], 0
+        for track in np.flatnonzero((category >= SCORED) & tracks.valid[:, CURRENT_STEP]):
+            path = tracks.position[track, HISTORY_STEPS - 1 :][tracks.valid[track, HISTORY_STEPS - 1 :]]
+            is_cut = ground.leaves_through_cut(path[:, :2].astype(np.float64))
+            num_cut += is_cut
+            if not is_cut:
+                predicted.append(track)
+        scenario = Scenario(
+            scenario_id=f"{rows['scenario_id'][0]}{suffix}",
+            timestamps_s=np.round(np.arange(tracks.valid.shape[1]) * STEP_S, 1),
+            tracks=tracks,
+            map_features=map_features,
+            lights=LightStates.of([]),
+            ego_index=int(ego_indices[0]),
+            tracks_to_predict=np.array(predicted, np.int32),
+            difficulty=np.zeros(len(predicted), np.int8),
+            objects_of_interest=tracks.object_id[category == FOCAL],
+            source="av2",
+            guessed=frozenset(("size", "z")),
+        )
+        yield scenario, num_cut
 
 
 def _read_rows(file: Path) -> Rows:
     """Rows of a Parquet file of the published schema."""
-    try:
-        table = read_parquet(file, "get the file again")
-    except FileNotFoundError:
-        raise DataError(f"{file.name} is missing: get the file again") from None
+    remedy = "get the file again"
+    table = read_parquet(file, remedy, missing=f"{file.name} is missing: {remedy}")
     try:
         for name in table.schema.names:
-            if name not in _NEEDED | _OPTIONAL and not name.startswith("__index_level_"):
+            if not any(name in columns for columns in _SCHEMA) and not name.startswith("__index_level_"):
                 raise DataError(f"{file.name} has the unknown column {name}")
-        rows = read_rows(file.name, table, _NEEDED, _OPTIONAL)
+        rows = read_rows(file.name, table, _SCHEMA)
     except DataError as error:
         raise DataError(f"{error}: its schema is not the published one") from None
     if not len(rows):
@@ -347,10 +330,8 @@ def _find_map(file: Path) -> Path:
 def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
     """Sizes by kind from a JSON file."""
     example = '{"vehicle": [4.6, 2.0, 1.6]}'
-    try:
-        sizes = read_json(path, f"sizes are written like {example}", error=ConfigError)
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file: sizes are written like {example}.") from None
+    remedy = f"sizes are written like {example}"
+    sizes = read_json(path, remedy, error=ConfigError, missing=f"{path}: no such file: {remedy}.")
     for object_type, size in sizes.items():
         if object_type not in SIZES_M:
             raise ConfigError(f"{path}: no kind {object_type!r}: known are {', '.join(SIZES_M)}.")

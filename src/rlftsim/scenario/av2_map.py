@@ -123,10 +123,8 @@ def read_map(path: Path) -> tuple[MapFeatures, Ground]:
         DataError: The file is damaged, or not of the published schema.
         ConfigError: shapely is not installed.
     """
-    try:
-        archive = read_json(path, "get the file again")
-    except FileNotFoundError:
-        raise DataError(f"{path.name} is missing: get the file again") from None
+    remedy = "get the file again"
+    archive = read_json(path, remedy, missing=f"{path.name} is missing: {remedy}")
     groups = {}
     for name in ("lane_segments", "pedestrian_crossings", "drivable_areas"):
         groups[name] = archive.get(name)

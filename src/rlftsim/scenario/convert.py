@@ -19,12 +19,13 @@ from pathlib import Path
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
 from rlftsim.jobs.documents import parse_json, read_json
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import check_result_file, remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, check_name
 from rlftsim.jobs.items import ResultFormat, run_items
 from rlftsim.jobs.runner import Runner, check_finished, choose_runner, select_items, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
+    INDEX,
     MANIFEST,
     SHARDS,
     Manifest,
@@ -37,9 +38,10 @@ from rlftsim.scenario.dataset import (
     write_json,
 )
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
-from rlftsim.scenario.source import DataSource, Unit, read_unit, units_of_urls
+from rlftsim.scenario.source import BytesRead, DataSource, Tally, Unit, read_unit, units_of_urls
 from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, find_source
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
+from rlftsim.scenario.types import Scenario
 
 _INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on."
 _RECEIPTS = "*.arrow.json"
@@ -229,8 +231,10 @@ def convert(
             shards.read(task)  # refuses those of other shares that were read with other settings
     # The folder is marked as unfinished until the mark is removed.
     with Lease(folder / INCOMPLETE, runner, "is converting to", _INCOMPLETE_TEXT) as lease:
+        outputs = [folder / name for task in tasks for name in (task.shard, f"{task.shard}.json")]
+        outputs += [folder / INDEX, folder / MANIFEST]
         if lease.is_alone:
-            remove_temporaries_below(folder)
+            remove_temporaries(outputs)
         finished = _find_finished(folder)
         outcomes = run_items(
             "convert", [replace(task, finished=finished.get(task.shard)) for task in tasks],
@@ -239,7 +243,7 @@ def convert(
         )  # fmt: skip
         num_changed = sum(not task.agrees(outcome.entry) for task, outcome in zip(tasks, outcomes))
         check_finished(runner, num_changed, len(tasks), "convert")  # sources that changed meanwhile
-        remove_temporaries_below(folder)  # of processes that were killed
+        remove_temporaries(outputs)  # of processes that were killed
         earlier = _earlier_manifest(folder)
         manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note, lease)
         lease.remove()
@@ -251,6 +255,7 @@ def _find_finished(folder: Path) -> dict[str, _FinishedShard]:
     earlier = _earlier_manifest(folder)
     shards = {entry.file: _FinishedShard(entry, earlier.provenance) for entry in earlier.shards}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
+        check_result_file(path)
         with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
             receipt = read_json(path, "convert again")
             settings = receipt.pop("settings")
@@ -295,7 +300,7 @@ def _convert_unit(
     Args:
         task: Unit of the source, the shard to make, and the finished shard of that name.
         advance: Callback for the number of bytes that were read or need not be.
-        is_stopped: True once the shard is not needed any more; asked after each scenario.
+        is_stopped: True once the shard is not needed any more; asked after each item.
         source: Reader of the unit, with the options of the command.
 
     Raises:
@@ -329,28 +334,23 @@ def _convert_unit(
     # 2. Read and write record by record, so that memory does not grow with the file.
     skipped: list[SkippedRecord] = []
     tallies: Counter[str] = Counter()
-    bytes_left = size
-
-    def count(num_bytes: int) -> None:
-        nonlocal bytes_left
-        bytes_left -= num_bytes
-        advance(num_bytes)
-
+    num_read = 0
     with ShardWriter(task.folder / task.shard) as writer:
-        scenarios = read_unit(
-            source,
-            task.unit,
-            on_error=task.on_error,
-            report=skipped.append,
-            advance=count,
-            tally=lambda tally: tallies.update({tally.event: tally.count}),
-        )
-        for record, scenario in scenarios:
-            writer.add(scenario, task.split, record)
+        for record, item in read_unit(source, task.unit, on_error=task.on_error):
+            match item:
+                case Scenario():
+                    writer.add(item, task.split, record)
+                case SkippedRecord():
+                    skipped.append(item)
+                case BytesRead():
+                    advance(item)
+                    num_read += item
+                case Tally():
+                    tallies[item.event] += item.count
             if is_stopped():
                 raise _Stopped
     # bytes between records, and all of them for a source that does not count
-    advance(bytes_left)
+    advance(size - num_read)
 
     # 3. Leave a receipt: from now on the shard counts as finished.
     if len(task.unit.files) == 1:  # the same bytes wherever the sources lie

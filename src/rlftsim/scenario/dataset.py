@@ -8,12 +8,18 @@ A data set is complete: the source files are never opened again.
     INCOMPLETE          only while a conversion runs or after it was interrupted
 
 Files are written under temporary names and renamed, so a file under a final name is complete.
+
+Scenarios of a cluster share a street network or a recording. Choices are made on the split `tune`; `exam` is looked at
+once. Where a data set stores no splits of these names, a fixed third of the clusters of the validation split is `exam`
+and two thirds are `tune`. Of generated scenarios `tune` is all of validation, because the exam is generated, too:
+`rlftsim experiment exam`.
 """
 
 import difflib
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,7 +33,7 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Int64, Shaped
+from jaxtyping import Bool, Int64, Shaped
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError, check_types, whole_number
@@ -36,10 +42,16 @@ from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import errors_name, write_atomically, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
-from rlftsim.scenario.index_row import AGENT_COLUMNS
-from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
-from rlftsim.scenario.splits import find_clusters, find_split
-from rlftsim.scenario.synthetic.pack import pack_path
+from rlftsim.scenario.shards import (
+    AGENT_COLUMNS,
+    INDEX_FIELDS,
+    SCHEMA_VERSION,
+    ShardReader,
+    ShardWriter,
+    check_scenario,
+    hash_file,
+)
+from rlftsim.scenario.synthetic import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
 
@@ -48,6 +60,9 @@ MANIFEST, INDEX, INCOMPLETE, SHARDS = "manifest.json", "index.parquet", "INCOMPL
 DEFAULT_LICENSE_NOTE = "The license of the source data applies to this data set."
 SYNTHETIC = "synthetic"
 """Name of the data set that ships with the package."""
+VALIDATION, TUNE, EXAM = "validation", "tune", "exam"
+_AV2_WINDOW = re.compile(r"-(0|19)$")
+"""End of the id of one of the two windows of a recording."""
 _MAX_OPEN_SHARDS = 128  # each holds a file descriptor; systems allow 256 to 1024
 INDEX_SCHEMA = pa.schema([*INDEX_FIELDS, pa.field("shard", pa.string()), pa.field("row", pa.int32())])
 
@@ -101,7 +116,7 @@ class ScenarioDataset:
         folder: Folder of the data set, also in a bucket (s3://bucket/folder), of which shards are fetched when they are
             needed; "synthetic" = the data set that ships with the package.
         split: Split of the scenarios, e.g. "training"; None = all splits. "tune" and "exam" are drawn from validation
-            if not stored, see `scenario.splits`.
+            if not stored, see the module.
         cache_size: Number of decoded scenarios in memory, about 1 MB each; the least recently used go first.
 
     Raises:
@@ -121,7 +136,7 @@ class ScenarioDataset:
             raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
         self.index = index
         if split is not None:
-            is_in_split = find_split(self, split)
+            is_in_split = self._find_split(split)
             if split not in self.manifest.counts and not is_in_split.any():
                 splits = ", ".join(self.manifest.counts) or "none"
                 raise DataError(
@@ -151,8 +166,11 @@ class ScenarioDataset:
 
     @cached_property
     def clusters(self) -> Shaped[np.ndarray, "scenarios"]:
-        """Label of each scenario's street network or recording, see `find_clusters`."""
-        return find_clusters(self)
+        """Label of each scenario's street network (synthetic) or recording (Argoverse 2), else the scenario id.
+
+        Scenarios of one label are not independent: statistics count labels.
+        """
+        return self._label_clusters()
 
     def find_cluster(self, scenario_id: str) -> str:
         """Label of a scenario's street network or recording."""
@@ -218,6 +236,40 @@ class ScenarioDataset:
         split = "" if self.split is None else f", split {self.split!r}"
         return f"ScenarioDataset({str(self.folder)!r}{split}, {len(self)} scenarios)"
 
+    def _label_clusters(self) -> Shaped[np.ndarray, "scenarios"]:
+        """Labels of the scenarios in the index, see `clusters`."""
+        networks = self._find_networks()
+        columns = (self.index[name].to_pylist() for name in ("scenario_id", "source", "shard"))
+        labels = [
+            networks.get(shard) or (_AV2_WINDOW.sub("", scenario_id) if source == "av2" else scenario_id)
+            for scenario_id, source, shard in zip(*columns)
+        ]
+        return np.array(labels, dtype=object)
+
+    def _find_networks(self) -> dict[str, str]:
+        """Street network by shard, of generated scenarios; empty for logged ones.
+
+        Raises:
+            DataError: The manifest's list of networks is damaged.
+        """
+        networks: Any = self.manifest.provenance.get("networks", ())
+        try:
+            return {f"shards/{entry['shard']}": "/".join(map(str, entry["seed"])) for entry in networks}
+        except (TypeError, KeyError) as error:
+            raise DataError(
+                f"{self.folder}: the manifest's list of networks is damaged ({error}): generate again."
+            ) from None
+
+    def _find_split(self, split: str) -> Bool[np.ndarray, "scenarios"]:
+        """True for the scenarios of a split, stored or drawn, see the module; all False for an unknown split."""
+        stored = self.index["split"].to_numpy(zero_copy_only=False)
+        if split not in (TUNE, EXAM) or split in stored:
+            return stored == split
+        if self._find_networks():
+            return (stored == VALIDATION) & (split == TUNE)
+        is_exam = np.array([is_in_exam(label) for label in self._label_clusters()], dtype=bool)
+        return (stored == VALIDATION) & (is_exam == (split == EXAM))
+
     def _read(self, position: int) -> Scenario:
         """Scenario at a position, decoded."""
         name, row = self._shard_names[position], self._rows[position]
@@ -248,6 +300,11 @@ class ScenarioDataset:
             split = f" (split {self.split})" if self.split else ""
             raise DataError(f"{self.folder}{split} has no scenario {scenario_id!r}")
         return self[self._position[scenario_id]]
+
+
+def is_in_exam(label: str) -> bool:
+    """True for a third of all labels of clusters: the same labels on any machine and in any data set."""
+    return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8]) % 3 == 0
 
 
 def write_dataset(
@@ -313,6 +370,7 @@ def _write_shards(
                     raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
                 if scenario.scenario_id in ids:
                     raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
+                check_scenario(scenario)
                 writer.add(scenario, split(scenario) if callable(split) else split)
                 ids.add(scenario.scenario_id)
         entries.append(describe_shard(folder, writer.path, writer.num_rows))
@@ -473,10 +531,7 @@ def load_index(folder: Path) -> pa.Table:
     Raises:
         DataError: The file is missing or damaged.
     """
-    try:
-        index = read_parquet(folder / INDEX, "convert again")
-    except FileNotFoundError:
-        raise DataError(f"{folder / INDEX} is missing: convert again") from None
+    index = read_parquet(folder / INDEX, "convert again", missing=f"{folder / INDEX} is missing: convert again")
     try:
         check_columns(index, INDEX_SCHEMA)
     except DataError as error:

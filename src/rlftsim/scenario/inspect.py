@@ -20,8 +20,7 @@ from rlftsim.scenario.dataset import (
     load_index,
     read_manifest,
 )
-from rlftsim.scenario.index_row import AGENT_COLUMNS
-from rlftsim.scenario.shards import ShardReader, hash_file
+from rlftsim.scenario.shards import AGENT_COLUMNS, ShardReader, hash_file
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, STEP_S, ObjectType, Scenario
 
 TELEPORT_SPEED_MPS = 60.0
@@ -196,7 +195,7 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
         detail = f"lane {lane} has {count[entries[0]]} different states at step {step}{_format_repeats(len(entries))}"
         yield Finding(Problem.CONTRADICTORY_LIGHTS, scenario_id, detail)
 
-    contradictions = describe_contradictions(tracks)
+    contradictions = describe_contradictions(tracks, scenario.map_features, scenario.guessed)
     if contradictions:
         yield Finding(Problem.CONTRADICTORY_MOTION, scenario_id, contradictions)
 
@@ -282,16 +281,16 @@ def _count(values: list) -> dict:
 
 def _compute_speeds(dataset: ScenarioDataset, positions: np.ndarray) -> dict[str, SpeedStats]:
     """Speeds by type of agent, over the scenarios at some positions of a data set."""
-    by_type: dict[ObjectType, list[np.ndarray]] = {object_type: [] for object_type in ObjectType}
+    speeds, types = [np.zeros(0)], [np.zeros(0, np.int8)]
     for position in positions:
         scenario = dataset[int(position)]
-        tracks, agents = scenario.tracks, scenario.simulated_indices
-        speed = np.linalg.norm(tracks.velocity[agents].astype(np.float64), axis=-1)
-        for object_type, values in by_type.items():
-            values.append(speed[tracks.valid[agents] & (tracks.object_type[agents] == object_type)[:, None]])
-    merged = {object_type.name.lower(): np.concatenate(values) for object_type, values in by_type.items() if values}
+        tracks = scenario.tracks.select(scenario.simulated_indices)
+        speeds.append(np.linalg.norm(tracks.velocity.astype(np.float64), axis=-1)[tracks.valid])
+        types.append(np.repeat(tracks.object_type, tracks.valid.sum(1)))
+    speed, object_type = np.concatenate(speeds), np.concatenate(types)
+    groups = {member.name.lower(): speed[object_type == member] for member in ObjectType}
     return {
-        name: SpeedStats(float(speed.mean()), float(np.quantile(speed, 0.95)), float(speed.max()))
-        for name, speed in merged.items()
-        if len(speed)
+        name: SpeedStats(float(group.mean()), float(np.quantile(group, 0.95)), float(group.max()))
+        for name, group in groups.items()
+        if len(group)
     }

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from rlftsim.geometry import wrapped
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import LANE_TYPES, Scenario
+from rlftsim.scenario.types import LANE_TYPES, Scenario, cached_on_scenario
 
 JOINT_M = 1.2
 """Largest gap between the end of a lane and the start of the next."""

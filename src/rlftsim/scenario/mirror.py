@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import ROAD_EDGE_TYPES, MapFeatures, Scenario
+from rlftsim.scenario.types import ROAD_EDGE_TYPES, MapFeatures, Scenario, cached_on_scenario
 
 _FLIP_Y = np.array([1.0, -1.0, 1.0], np.float32)
 

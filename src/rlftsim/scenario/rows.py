@@ -10,10 +10,12 @@ from jaxtyping import Bool, Int64
 
 from rlftsim.errors import DataError
 
-WORDS, NOTES, NUMBERS, INTEGERS = "text", "text or nothing", "numbers", "whole numbers"
-NAMES_OR_NUMBERS, TRUTHS = "names or whole numbers", "True or False"
-LISTS, WORD_LISTS = "lists of whole numbers", "lists of words"
-"""Contents of a column. Notes and lists may have empty cells; empty numbers are NaN, an error where it matters."""
+Schema = tuple[Mapping[str, str], Mapping[str, str]]
+"""Contents by name of the columns that are needed, and of those that may be left out. Further columns are ignored.
+
+Contents are the words of `_read_column`. "text or nothing" and lists may have empty cells; empty numbers are NaN, an
+error where it matters.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +54,18 @@ class Rows:
             raise self.error(row, cause.format(*(column[row] for column in values)))
 
 
-def read_rows(name: str, table: pa.Table, needed: Mapping[str, str], optional: Mapping[str, str]) -> Rows:
-    """Rows of an Arrow table, in the types of a schema; further columns are ignored.
+def read_rows(name: str, table: pa.Table, schema: Schema) -> Rows:
+    """Rows of an Arrow table, in the types of a schema.
 
     Args:
         name: Name of the table in messages, such as the name of the file.
         table: Table with any columns.
-        needed: Content of each needed column by name, such as `NUMBERS`.
-        optional: Content of each column that may be left out.
+        schema: Contents of needed and of optional columns.
 
     Raises:
         DataError: A column is missing, of a wrong type or has empty cells.
     """
+    needed, optional = schema
     for column in needed:
         if column not in table.schema.names:
             raise DataError(f"{name} has no column {column}")
@@ -83,30 +85,30 @@ def _read_column(table: str, name: str, column: pa.ChunkedArray, content: str) -
     )
     is_word = is_text or types.is_integer(cell_type) or types.is_null(cell_type)
     fits = {
-        WORDS: is_word,
-        NOTES: is_word,
-        NUMBERS: types.is_floating(cell_type) or types.is_integer(cell_type),
-        INTEGERS: types.is_integer(cell_type),
-        LISTS: (is_list and types.is_integer(item_type)) or types.is_null(item_type),
-        WORD_LISTS: (is_list and has_text_items) or types.is_null(item_type),
-        NAMES_OR_NUMBERS: is_text or types.is_integer(cell_type),
-        TRUTHS: types.is_boolean(cell_type),
+        "text": is_word,
+        "text or nothing": is_word,
+        "numbers": types.is_floating(cell_type) or types.is_integer(cell_type),
+        "whole numbers": types.is_integer(cell_type),
+        "lists of whole numbers": (is_list and types.is_integer(item_type)) or types.is_null(item_type),
+        "lists of words": (is_list and has_text_items) or types.is_null(item_type),
+        "names or whole numbers": is_text or types.is_integer(cell_type),
+        "True or False": types.is_boolean(cell_type),
     }[content]
     if not fits:
         raise DataError(f"{table}: column {name} is {column.type}, it must have {content}")
-    if column.null_count and content not in (NOTES, NUMBERS, LISTS, WORD_LISTS):
+    if column.null_count and content not in ("text or nothing", "numbers", "lists of whole numbers", "lists of words"):
         row = np.flatnonzero(column.is_null().to_numpy())[0]
         raise DataError(f"{table}: row {row}: {name} is empty")
     try:
-        if content == NUMBERS:
+        if content == "numbers":
             return column.cast(pa.float64(), safe=False).to_numpy()
-        if content == INTEGERS:
+        if content == "whole numbers":
             return column.cast(pa.int64()).to_numpy()
-        if content == TRUTHS:
+        if content == "True or False":
             return column.to_numpy()
         values = np.empty(len(column), object)
         values[:] = column.to_pylist()
-        if content in (WORDS, NOTES):
+        if content in ("text", "text or nothing"):
             values[:] = [None if value is None else str(value) for value in values]
         return values
     except pa.ArrowException as error:

@@ -9,7 +9,6 @@ import os
 from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,8 @@ from rlftsim.errors import DataError
 from rlftsim.jobs.files import errors_name, temporary_path
 from rlftsim.jobs.tables import map_arrow
 from rlftsim.scenario.codec import decode_array, encode_array
-from rlftsim.scenario.index_row import IndexRow, compute_index_row
-from rlftsim.scenario.types import LaneTopology, LightStates, MapFeatures, Scenario, Tracks
+from rlftsim.scenario.maneuver import classify_ego_maneuver
+from rlftsim.scenario.types import LaneTopology, LightStates, MapFeatures, ObjectType, Scenario, Tracks
 
 SCHEMA_VERSION = 1
 _ROWS_PER_BATCH = 16
@@ -63,13 +62,50 @@ _ARRAY_DTYPES = {
     for name, (dtype, *components) in _ARRAYS.items()
     for component in components or [""]
 }
-_INDEX_TYPES = {str: pa.string(), int: pa.int32()}
-INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in fields(IndexRow))
+AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
+"""Counts that add up to a scenario's simulated agents."""
+_COUNTS = ("num_steps", *AGENT_COLUMNS, "num_evaluated", "num_map_features", "num_map_points", "num_light_states")
+INDEX_FIELDS = (
+    *(pa.field(name, pa.string()) for name in ("scenario_id", "split")),
+    *(pa.field(name, pa.int32()) for name in _COUNTS),
+    *(pa.field(name, pa.string()) for name in ("ego_maneuver", "source", "guessed")),
+)
+"""Columns of the index that are stored in every row of a shard, see `compute_index_row`."""
 _ROW_FIELDS = (("source_record", pa.int32()), ("ego_index", pa.int32()), ("checksum", pa.uint32()))
 _SCHEMA = pa.schema(
     [*INDEX_FIELDS, *_ROW_FIELDS, *((name, pa.binary()) for name in _ARRAY_DTYPES)],
     metadata={"format": "rlftsim scenarios", "schema_version": str(SCHEMA_VERSION)},
 )
+
+
+def compute_index_row(scenario: Scenario, split: str) -> dict[str, str | int]:
+    """Row of a scenario in the index of a data set, by the names of `INDEX_FIELDS`.
+
+    Agents are counted at the current step. `guessed` has the words of `Scenario.guessed` in alphabetical order, with
+    spaces between them.
+
+    Args:
+        scenario: Scenario whose contents are counted.
+        split: Name of the split that the scenario belongs to, such as "training".
+    """
+    agent_types = scenario.tracks.object_type[scenario.simulated_indices]
+    count = {object_type: int((agent_types == object_type).sum()) for object_type in ObjectType}
+    return {
+        "scenario_id": scenario.scenario_id,
+        "split": split,
+        "num_steps": scenario.num_steps,
+        "num_vehicles": count[ObjectType.VEHICLE],
+        "num_pedestrians": count[ObjectType.PEDESTRIAN],
+        "num_cyclists": count[ObjectType.CYCLIST],
+        "num_others": count[ObjectType.OTHER] + count[ObjectType.UNSET],
+        "num_evaluated": len(scenario.evaluated_indices),
+        "num_map_features": len(scenario.map_features),
+        "num_map_points": len(scenario.map_features.points),
+        "num_light_states": len(scenario.lights.step),
+        "ego_maneuver": classify_ego_maneuver(scenario).value,
+        "source": scenario.source,
+        "guessed": " ".join(sorted(scenario.guessed)),
+    }
 
 
 class ShardWriter:
@@ -108,17 +144,16 @@ class ShardWriter:
         """Append a scenario.
 
         Args:
-            scenario: Scenario that passes `check_scenario`.
+            scenario: Scenario that has passed `check_scenario`.
             split: Name of the scenario's split, such as "training".
             source_record: Number of the record in the file of the source, from 0; None without such a file.
 
         Raises:
-            DataError: The scenario is unsound, or the file cannot be written (a full disk, say).
+            DataError: The file cannot be written (a full disk, say).
         """
-        check_scenario(scenario)
         # every array separately: each has the encoding that suits the values
         encoded = {name: None if array is None else encode_array(array) for name, array in _to_arrays(scenario).items()}
-        row = asdict(compute_index_row(scenario, split)) | {"source_record": source_record}
+        row = compute_index_row(scenario, split) | {"source_record": source_record}
         row |= {"ego_index": scenario.ego_index, "checksum": _checksum(encoded)}
         self._pending.append(row | encoded)
         self.num_rows += 1
@@ -181,7 +216,7 @@ class ShardReader:
         return self._table.num_rows
 
     def index_rows(self) -> pa.Table:
-        """Columns of `IndexRow` and `source_record`, a row per scenario; a copy in memory."""
+        """Columns of `INDEX_FIELDS` and `source_record`, a row per scenario; a copy in memory."""
         schema = pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())])
         return pa.table({name: self._table[name].to_pylist() for name in schema.names}, schema=schema)
 

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -14,7 +14,7 @@ from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
 
 _SPLIT = re.compile(r"training|validation|testing")
-CONTRADICTORY = "scenarios whose velocities or headings contradict their positions: `rlftsim data verify` names them"
+CONTRADICTORY = "scenarios whose velocities, headings or heights contradict the rest: `rlftsim data verify` names them"
 
 
 @dataclass(frozen=True)
@@ -87,57 +87,39 @@ class DataSource(Protocol):
         ...
 
 
-def read_unit(
-    source: DataSource,
-    unit: Unit,
-    *,
-    on_error: OnError,
-    report: Callable[[SkippedRecord], None],
-    advance: Callable[[int], object] = lambda _: None,
-    tally: Callable[[Tally], object] = lambda _: None,
-) -> Iterator[tuple[int, Scenario]]:
-    """Read a unit; yields the number of each record, from 0, with the scenario.
+def read_unit(source: DataSource, unit: Unit, *, on_error: OnError) -> Iterator[tuple[int, Item]]:
+    """Read a unit; yields the items of the source with the number of each record, from 0.
+
+    Here every scenario of every source is checked, once; one that is unsound becomes a `SkippedRecord`.
 
     Args:
         source: Data source that reads the unit.
         unit: Unit that the source's `find` returned.
-        on_error: "stop" raises at the first bad record, "skip" reports the record and goes on.
-        report: Function called with each skipped record, only under "skip".
-        advance: Function called with the number of bytes read since the last call, if the source counts bytes.
-        tally: Function called with each count of the source.
+        on_error: "stop" raises at the first bad record, "skip" yields the record as a `SkippedRecord` and goes on.
 
     Raises:
         BadRecordError: A bad record under "stop"; the message names file, record and cause.
         DataError: A file cannot be read.
     """
-    # Errors of the code that consumes the scenarios do not pass through here: only reading is inside the `try`.
+    # Errors of the code that consumes the items do not pass through here: only reading is inside the `try`.
     record = 0
     try:
         for item in source.read(unit):
-            if isinstance(item, BytesRead):
-                advance(item)  # no record
-                continue
-            if isinstance(item, Tally):
-                tally(item)
-                continue
             if isinstance(item, Scenario):
                 try:
                     check_scenario(item)
+                    if describe_contradictions(item.tracks, item.map_features, item.guessed):
+                        yield record, Tally(CONTRADICTORY, 1)
                 except DataError as error:
                     item = SkippedRecord(unit.name, record, str(error))
-            if isinstance(item, Scenario):
-                if describe_contradictions(item.tracks):
-                    tally(Tally(CONTRADICTORY, 1))
-                yield record, item
-            elif on_error == "stop":
+            if isinstance(item, SkippedRecord) and on_error == "stop":
                 raise DataError(str(item))
-            else:
-                report(item)
-            record += 1
+            yield record, item
+            record += isinstance(item, Scenario | SkippedRecord)
     except DataError as error:
         if on_error == "stop":
             raise BadRecordError(str(error)) from error
-        report(SkippedRecord(unit.name, record, str(error)))
+        yield record, SkippedRecord(unit.name, record, str(error))
     except OSError as error:
         raise DataError(f"{error.filename or unit.name}: cannot be read: {error.strerror or error}") from error
 

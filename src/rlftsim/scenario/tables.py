@@ -24,18 +24,7 @@ from rlftsim.geometry import wrapped
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.polylines import Heights, densify, find_runs
-from rlftsim.scenario.rows import (
-    INTEGERS,
-    LISTS,
-    NAMES_OR_NUMBERS,
-    NOTES,
-    NUMBERS,
-    TRUTHS,
-    WORD_LISTS,
-    WORDS,
-    Rows,
-    read_rows,
-)
+from rlftsim.scenario.rows import Rows, Schema, read_rows
 from rlftsim.scenario.source import BytesRead, Item, Unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
@@ -72,32 +61,31 @@ MAX_PREDICTED = 8
 SIZE_COLUMNS = ("length", "width", "height")
 _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
-_SCHEMAS: Mapping[str, tuple[dict[str, str], dict[str, str]]] = {
+_SCHEMAS: Mapping[str, Schema] = {
     TRACKS: (
-        {"scenario_id": WORDS, "object_id": INTEGERS, "type": NAMES_OR_NUMBERS, "step": INTEGERS}
-        | dict.fromkeys(("x", "y", "heading", "vx", "vy"), NUMBERS),
-        dict.fromkeys(("z", *SIZE_COLUMNS), NUMBERS),
+        {"scenario_id": "text", "object_id": "whole numbers", "type": "names or whole numbers", "step": "whole numbers"}
+        | dict.fromkeys(("x", "y", "heading", "vx", "vy"), "numbers"),
+        dict.fromkeys(("z", *SIZE_COLUMNS), "numbers"),
     ),
     MAP: (
-        {"feature_id": INTEGERS, "type": NAMES_OR_NUMBERS, "x": NUMBERS, "y": NUMBERS},
-        {"scenario_id": WORDS, "map_id": WORDS, "z": NUMBERS},
+        {"feature_id": "whole numbers", "type": "names or whole numbers", "x": "numbers", "y": "numbers"},
+        {"scenario_id": "text", "map_id": "text", "z": "numbers"},
     ),
     SCENARIOS: (
-        {"scenario_id": WORDS, "ego_id": INTEGERS},
-        {"map_id": WORDS, "license": NOTES, "step_s": NUMBERS, "first_step": INTEGERS}
-        | {"predict": LISTS, "interest": LISTS, "guessed": WORD_LISTS},
+        {"scenario_id": "text", "ego_id": "whole numbers"},
+        {"map_id": "text", "license": "text or nothing", "step_s": "numbers", "first_step": "whole numbers"}
+        | {"predict": "lists of whole numbers", "interest": "lists of whole numbers", "guessed": "lists of words"},
     ),
     LANES: (
-        {"lane_id": INTEGERS},
-        {"scenario_id": WORDS, "map_id": WORDS, "speed_limit_mph": NUMBERS, "interpolating": TRUTHS}
-        | dict.fromkeys(("entry", "exit", "left", "right"), LISTS),
+        {"lane_id": "whole numbers"},
+        {"scenario_id": "text", "map_id": "text", "speed_limit_mph": "numbers", "interpolating": "True or False"}
+        | dict.fromkeys(("entry", "exit", "left", "right"), "lists of whole numbers"),
     ),
     LIGHTS: (
-        {"scenario_id": WORDS, "step": INTEGERS, "lane_id": INTEGERS, "state": NAMES_OR_NUMBERS},
-        dict.fromkeys(("x", "y", "z"), NUMBERS),
+        {"scenario_id": "text", "step": "whole numbers", "lane_id": "whole numbers", "state": "names or whole numbers"},
+        dict.fromkeys(("x", "y", "z"), "numbers"),
     ),
 }
-"""Columns of each table that are needed, and columns that may be left out. Further columns are ignored."""
 
 
 class TablesSource:
@@ -188,11 +176,11 @@ def _read_scenario(row: Rows, tables: Mapping[str, Rows]) -> Scenario:
     if ego < 0 or not tracks.valid[ego, CURRENT_STEP]:
         raise row.error(0, f"no ego: object {ego_id} is not there 1 s after step {first_step}, the current step")
     _check_edge_directions(map_rows, map_features)
-    contradictions = describe_contradictions(tracks)
+    contradictions = describe_contradictions(tracks, map_features, guessed)
     if contradictions:
         raise DataError(
             f"{TRACKS}: {contradictions}: vx and vy are m/s along x and y of the same frame, headings radians "
-            f"counter-clockwise from +x, and step_s in {SCENARIOS} the seconds between two steps"
+            f"counter-clockwise from +x, z m as the map's, and step_s in {SCENARIOS} the seconds between two steps"
         )
     predicted = _find_indices(row, "predict", tracks)
     if predicted is None:
@@ -265,8 +253,8 @@ def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures
                 size[track, :, column] = rows[name][span][row_index]
         reversed_step = _find_reversed(states[track], valid[track]) if types[track] != ObjectType.PEDESTRIAN else None
         if reversed_step is not None:
-            raise rows.error(start + row_index[reversed_step], f"object {ids[start]} moves against its heading "
-                             f"faster than {MOVING_MPS:g} m/s for more than {REVERSED_S:g} s")  # fmt: skip
+            motion = f"moves against its heading faster than {MOVING_MPS:g} m/s for more than {REVERSED_S:g} s"
+            raise rows.error(start + row_index[reversed_step], f"object {ids[start]} {motion}")
     if "z" in rows:
         z = states[..., 5]
     else:
@@ -333,7 +321,7 @@ def _find_indices(row: Rows, name: str, tracks: Tracks) -> list[int] | None:
     ids = row.first(name)
     if ids is None:
         return None
-    index = {int(object_id): k for k, object_id in enumerate(tracks.object_id)}
+    index = {object_id: k for k, object_id in enumerate(tracks.object_id.tolist())}
     for object_id in ids:
         if object_id not in index:
             raise row.error(0, f"{name} lists object {object_id}, which has no state in the scenario")
@@ -380,7 +368,7 @@ def _read_topology(rows: Rows | None, features: Sequence[tuple[int, int, np.ndar
         for side, name in enumerate(("left", "right")):
             links["neighbors"] += [(lane, side, target, 0, last[lane], 0, last[target]) for target in targets[name]]
         limit = rows["speed_limit_mph"][row] if "speed_limit_mph" in rows else np.nan  # NaN = unknown
-        if np.isinf(limit):
+        if abs(limit) > np.finfo(np.float32).max:
             raise rows.error(row, f"speed_limit_mph is {limit:g}")
         speed_limit[index[lane]] = np.nan_to_num(limit)
         interpolating[index[lane]] = "interpolating" in rows and bool(rows["interpolating"][row])
@@ -406,12 +394,9 @@ def _check_edge_directions(rows: Rows, features: MapFeatures) -> None:
         is_close = distance < NEAR_LANE_M
         is_right = direction[:, 0] * towards[:, 1] - direction[:, 1] * towards[:, 0] < 0
         if is_right[is_close].sum() > WRONG_SIDE * max(is_close.sum(), 1):
-            feature_id = features.feature_id[index]
-            raise rows.error(
-                np.flatnonzero(rows["feature_id"] == feature_id)[0],
-                f"road edge {feature_id} has the lanes on its right (outer edges run counter-clockwise, those of "
-                "islands clockwise): reverse its points",
-            )
+            ids, rule = rows["feature_id"], "outer edges run counter-clockwise, those of islands clockwise"
+            cause = f"road edge {{}} has the lanes on its right ({rule}): reverse its points"
+            rows.check(ids == features.feature_id[index], cause, ids)
 
 
 def _read_lights(
@@ -443,8 +428,8 @@ def _read_lights(
 def _check_numbers(rows: Rows) -> None:
     """Raise a `DataError` at the first NaN, infinite or huge number in a column of numbers."""
     needed, optional = _SCHEMAS[rows.table]
-    for name, content in (needed | optional).items():
-        if content == NUMBERS and name in rows:
+    for name, content in {**needed, **optional}.items():
+        if content == "numbers" and name in rows:
             rows.check(~(np.abs(rows[name]) < _MAX_COORDINATE_M), name + " is {:g}", rows[name])  # NaN, too
 
 
@@ -495,11 +480,9 @@ def _read_table(path: Path) -> Rows:
     Raises:
         DataError: The table is missing or damaged, or a column is missing, of another type or has empty cells.
     """
-    try:
-        table = read_parquet(path, "write it again")
-    except FileNotFoundError:
-        raise DataError(f"{path.name}: there is no such table beside {TRACKS}") from None
-    rows = read_rows(path.name, table, *_SCHEMAS[path.name])
+    missing = f"{path.name}: there is no such table beside {TRACKS}"
+    table = read_parquet(path, "write it again", missing=missing)
+    rows = read_rows(path.name, table, _SCHEMAS[path.name])
     if path.name in (MAP, LANES) and "scenario_id" not in rows and "map_id" not in rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")
     return rows

@@ -6,10 +6,9 @@ A damaged checksum of the bytes costs one record. A damaged length costs the res
 next record follows from it alone.
 """
 
-import logging
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -49,11 +48,6 @@ def count_lost(skipped: Sequence[SkippedRecord]) -> str:
     return f"at least {len(skipped)}" if any(record.rest_is_lost for record in skipped) else str(len(skipped))
 
 
-def log_skipped(skipped: SkippedRecord) -> None:
-    """Log a skipped record as a warning of the logger `rlftsim`."""
-    logging.getLogger("rlftsim").warning("skipped %s", skipped)
-
-
 def masked_crc32c(data: bytes) -> int:
     """Checksum of `data` as TFRecord files store it, in [0, 2**32)."""
     # rotated and shifted, so that the checksum of data with an embedded checksum is not degenerate
@@ -80,23 +74,29 @@ def write_records(path: str | os.PathLike[str], records: Iterable[bytes]) -> int
     return count
 
 
-def read_records(
-    path: str | os.PathLike[str], *, on_error: OnError = "stop", report: Callable[[SkippedRecord], None] = log_skipped
-) -> Iterator[tuple[int, bytes]]:
+def read_records(path: str | os.PathLike[str]) -> Iterator[tuple[int, bytes]]:
     """Read a TFRecord file record by record, checking both checksums of each.
 
     Args:
         path: File to read, of any name.
-        on_error: "stop" raises at the first damage; "skip" reports the damage and goes on with the next record, as far
-            as the framing allows.
-        report: Function called with each skipped record, only under "skip".
 
     Yields:
         Number of the record in the file, from 0, and the record's bytes.
 
     Raises:
-        DataError: Damage under "stop"; the message names file, record and cause. Always: the file does not exist or
-            cannot be opened.
+        DataError: Damage; the message names file, record and cause. Also: the file does not exist or cannot be opened.
+    """
+    for record, data in enumerate(iterate_records(path)):
+        if isinstance(data, SkippedRecord):
+            raise DataError(str(data))
+        yield record, data
+
+
+def iterate_records(path: str | os.PathLike[str]) -> Iterator[bytes | SkippedRecord]:
+    """Bytes or damage of each record of a TFRecord file, as far as the framing allows.
+
+    Raises:
+        DataError: The file does not exist or cannot be opened.
     """
     path = Path(path)
     try:
@@ -109,15 +109,12 @@ def read_records(
         record = 0
         while file.tell() < size or size == 0:
             data, cause = _read_record(file, size, record)
-            if cause is not None:
-                skipped = SkippedRecord(str(path), record, cause, rest_is_lost=data is None)
-                if on_error == "stop":
-                    raise DataError(str(skipped))
-                report(skipped)
-                if data is None:
-                    return
-            elif data is not None:
-                yield record, data
+            if cause is None and data is not None:
+                yield data
+            else:
+                yield SkippedRecord(str(path), record, str(cause), rest_is_lost=data is None)
+            if data is None:
+                return
             record += 1
 
 

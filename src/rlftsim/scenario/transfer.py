@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rlftsim.errors import DataError
 from rlftsim.jobs.buckets import check_writable, fetch, folder_address, mirror, publish, remote_lease, remove
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.runner import Inline
@@ -69,13 +69,13 @@ def pull_dataset(url: str, folder: str | os.PathLike[str], *, show_progress: boo
     check_folder(folder, "data set")
     mark = folder / INCOMPLETE
     note = f"A copy of {url} runs here or was interrupted: run the same command again, it goes on."
-    is_begun = mark.exists() and mark.read_bytes().startswith(note.encode())
+    is_begun = mark.is_file() and mark.read_bytes().startswith(note.encode())
     if folder.exists() and not is_begun and any(folder.iterdir()):
         raise DataError(f"{folder} is not empty: choose another folder or delete it")
     manifest = read_manifest(source := mirror(url, (INDEX, MANIFEST)))
     # The folder is marked as unfinished until the mark is removed.
     with Lease(mark, Inline(), "is copying to", note) as lease:
-        remove_temporaries_below(folder)
+        remove_temporaries(folder / name for name in (INDEX, MANIFEST, *(entry.file for entry in manifest.shards)))
         with progress_bar("pull", len(manifest.shards), show=show_progress) as advance:
             for entry in manifest.shards:
                 path = folder / entry.file

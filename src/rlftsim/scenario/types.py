@@ -9,11 +9,12 @@ needed.
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
-from functools import cached_property
-from typing import Any, Protocol, get_args, runtime_checkable
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64, Shaped
@@ -297,10 +298,9 @@ class Scenario:
             DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
         features = self.map_features
-        _check_shapes(self.tracks, "tracks")
-        _check_shapes(features, "map")
-        _check_shapes(features.topology, "topology")
-        _check_shapes(self.lights, "lights")
+        tables = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
+        for name, table in tables.items():
+            _check_shapes(table, name)
 
     def check_consistency(self) -> None:
         """Check what every reader relies on: steps of 0.1 s, track indices, ids that differ, types, states, sizes, map.
@@ -343,10 +343,10 @@ class Scenario:
             )
 
     def check_finite_arrays(self) -> None:
-        """Check that every valid state and every map point is finite.
+        """Check that every valid state, map point and stop point is finite.
 
         Raises:
-            DataError: A NaN or an infinite number; the message names track, step and field, or map feature and point.
+            DataError: A NaN or an infinite number; the message names track, step and field, or the point.
         """
         tracks = self.tracks
         for name in ("position", "heading", "velocity", "size"):
@@ -367,6 +367,11 @@ class Scenario:
             raise DataError(
                 f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {index}): "
                 "correct it or leave the feature out"
+            )
+        entries = np.flatnonzero(~np.isfinite(self.lights.stop_point).all(-1))
+        if len(entries):
+            raise DataError(
+                f"stop point {entries[0]} of the traffic lights is NaN or infinite: correct it or leave the light out"
             )
 
     def check_precision(self) -> None:
@@ -535,3 +540,28 @@ def list_scenario_ids(scenarios: Scenarios) -> Iterable[str]:
     # a data set has the ids in the index: no scenario is read
     scenario_ids = getattr(scenarios, "scenario_ids", None)
     return scenario_ids if scenario_ids is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))
+
+
+Value = TypeVar("Value")
+Arguments = ParamSpec("Arguments")
+
+
+def cached_on_scenario(
+    compute: Callable[Concatenate[Scenario, Arguments], Value],
+) -> Callable[Concatenate[Scenario, Arguments], Value]:
+    """Decorator that caches a function of a scenario, and of further hashable arguments, with the scenario.
+
+    The values are dropped together with the scenario.
+    """
+    # weak keys: the cache must not keep a scenario in memory that its data set has dropped
+    cache: WeakKeyDictionary[Scenario, dict[Hashable, Value]] = WeakKeyDictionary()
+
+    @wraps(compute)
+    def remembered(scenario: Scenario, *arguments: Arguments.args, **named: Arguments.kwargs) -> Value:
+        values = cache.setdefault(scenario, {})
+        key = (arguments, tuple(named.items()))
+        if key not in values:
+            values[key] = compute(scenario, *arguments, **named)
+        return values[key]
+
+    return remembered

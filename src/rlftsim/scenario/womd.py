@@ -15,9 +15,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from rlftsim.errors import DataError
+from rlftsim.jobs.progress import log
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.source import BytesRead, Item, Unit, read_unit, units_of_files
-from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, log_skipped, read_records
+from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, iterate_records
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
@@ -72,21 +73,28 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
 
 
 def read_scenarios(
-    source: str | os.PathLike[str], on_error: OnError = "stop", *, report: Callable[[SkippedRecord], None] = log_skipped
+    source: str | os.PathLike[str], on_error: OnError = "stop", *, report: Callable[[SkippedRecord], None] | None = None
 ) -> Iterator[Scenario]:
     """Read the scenarios of tfrecord files, in the order of paths and records.
 
     Args:
         source: File, folder or glob, as in `find_tfrecords`.
         on_error: "stop" raises at the first bad file or record, "skip" reports the damage and goes on.
-        report: Function called with each skipped record, only under "skip".
+        report: Function called with each skipped record, only under "skip"; None = a warning of the logger `rlftsim`.
 
     Raises:
         DataError: No such file; under "stop" also a bad record: the message names file, record and cause.
     """
     for path in find_tfrecords(source):
-        for _, scenario in read_unit(WomdSource(), Unit(str(path), (path,)), on_error=on_error, report=report):
-            yield scenario
+        for _, item in read_unit(WomdSource(), Unit(str(path), (path,)), on_error=on_error):
+            if isinstance(item, Scenario):
+                yield item
+            elif isinstance(item, SkippedRecord):
+                (report or _log_skipped)(item)
+
+
+def _log_skipped(skipped: SkippedRecord) -> None:
+    log.warning("skipped %s", skipped)
 
 
 class WomdSource:
@@ -111,17 +119,15 @@ class WomdSource:
     def read(self, unit: Unit) -> Iterator[Item]:
         """Records of a tfrecord file in order, and the cause for each that is damaged or no scenario."""
         (path,) = unit.files
-        damaged: list[SkippedRecord] = []
-        for record, data in read_records(path, on_error="skip", report=damaged.append):
-            # the framing reports damage before it yields the next whole record
-            yield from damaged
-            damaged.clear()
+        for record, data in enumerate(iterate_records(path)):
+            if isinstance(data, SkippedRecord):
+                yield data
+                continue
             try:
-                yield scenario_from_bytes(data)
+                yield _parse_scenario(data)
             except DataError as error:
                 yield SkippedRecord(str(path), record, str(error))
             yield BytesRead(len(data) + RECORD_OVERHEAD_BYTES)
-        yield from damaged
 
     def describe(self) -> dict[str, object]:
         """Empty: no value of a record is guessed."""
@@ -139,6 +145,15 @@ def scenario_from_bytes(record: bytes) -> Scenario:
             point is not finite; the number of steps is another one; a track to predict does not exist; an object id
             occurs twice; a type is unknown; a size at step 10 is not above zero.
     """
+    scenario = _parse_scenario(record)
+    scenario.check_consistency()
+    scenario.check_finite_arrays()
+    scenario.check_precision()
+    return scenario
+
+
+def _parse_scenario(record: bytes) -> Scenario:
+    """Scenario of a message whose values have not been checked, see `scenario_from_bytes`."""
     try:
         message = womd_pb2.Scenario.FromString(record)
     except DecodeError as error:
@@ -164,7 +179,7 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         raise DataError(f"the ego (track {tracks.object_id[ego]}) is not valid at the current step ({CURRENT_STEP})")
     if len(message.timestamps_seconds) < num_steps:
         raise DataError(f"{len(message.timestamps_seconds)} timestamps for {num_steps} steps")
-    scenario = Scenario(
+    return Scenario(
         scenario_id=message.scenario_id,
         timestamps_s=np.array(message.timestamps_seconds[:num_steps], np.float64),
         tracks=tracks,
@@ -176,10 +191,6 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         objects_of_interest=np.array(message.objects_of_interest, np.int64),
         source="womd",
     )
-    scenario.check_consistency()
-    scenario.check_finite_arrays()
-    scenario.check_precision()
-    return scenario
 
 
 def _read_tracks(message: womd_pb2.Scenario) -> Tracks:

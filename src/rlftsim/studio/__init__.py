@@ -6,7 +6,22 @@ ES modules, which share `viewer/drawing.js` with the pages that stand alone. Nee
 'rlftsim[studio]'`.
 """
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, RlftsimError
+
+
+class Refusal(RlftsimError):
+    """A request that is not carried out.
+
+    Args:
+        message: Sentence with the value, the cause and the way out.
+        status: Status of the HTTP answer, 4xx.
+        hint: Further advice, which the page shows below the message.
+    """
+
+    def __init__(self, message: str, *, status: int = 422, hint: str = "") -> None:
+        super().__init__(message)
+        self.status = status
+        self.hint = hint
 
 
 def check_extra() -> None:

@@ -6,11 +6,11 @@ from pathlib import Path
 from rlftsim.goals.goals_file import parse_goals, write_goals
 from rlftsim.jobs.files import errors_name, write_atomically, write_text
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
+from rlftsim.studio import Refusal
 from rlftsim.studio.bodies import ExportBody, SaveGoalsBody
-from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.runs import Run
 from rlftsim.studio.session import Session
 from rlftsim.submission.messages import encode_rollouts

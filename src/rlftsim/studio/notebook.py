@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlftsim.errors import ConfigError, in_short
-from rlftsim.scenario.any_form import Name
+from rlftsim.scenario.open import Name
 from rlftsim.studio import check_extra
 
 if TYPE_CHECKING:

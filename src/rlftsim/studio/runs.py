@@ -11,6 +11,7 @@ import json
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -25,9 +26,9 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import FUTURE_STEPS
+from rlftsim.studio import Refusal
 from rlftsim.studio.bodies import RunBody
 from rlftsim.studio.encoding import encode_batch
-from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.scoring import Scored, score_variant
 from rlftsim.studio.session import Session
 from rlftsim.studio.variants import Variant, build_variants, free_variant, has_goals
@@ -35,7 +36,7 @@ from rlftsim.studio.variants import Variant, build_variants, free_variant, has_g
 FIRST_CHUNKS = (4, 4, 8, 16)
 LARGEST_CHUNK = 32
 KEPT_BYTES = 512 << 20
-KEPT_RUNS = 64
+KEPT_RUNS, KEPT_CONTEXTS = 64, 8
 
 
 class Cancelled(Exception):
@@ -134,10 +135,9 @@ def split_rollouts(num_rollouts: int) -> list[range]:
 def join_chunks(chunks: list[Rollouts]) -> Rollouts:
     """Rollouts of all chunks of a variant on the CPU; goals and draws are left out."""
 
-    def join(name: str) -> Tensor:
-        return torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu()
-
-    return Rollouts(join("position"), join("heading"), join("decision"), join("decision_mask"), join("log_prob"))
+    names = ("position", "heading", "decision", "decision_mask", "log_prob")
+    values: dict[str, Any] = {name: torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu() for name in names}
+    return Rollouts(**values)
 
 
 class Worker:
@@ -151,6 +151,7 @@ class Worker:
         self.session = session
         self.runs: OrderedDict[str, Run] = OrderedDict()
         self._simulated: OrderedDict[Variant, Simulated] = OrderedDict()
+        self._context = lru_cache(KEPT_CONTEXTS)(self._encode)
         self._wake = threading.Condition()
         self._waiting: Run | None = None
         self._running: Run | None = None
@@ -307,8 +308,7 @@ class Worker:
                 count=len(ids), steps=poses.shape[3],
             )  # fmt: skip
 
-        key = (model.name, variant.guidance, variant.split, variant.scenario)
-        context = self.session.contexts.get(key, lambda: _encode(policy, batch))
+        context = self._context(model.name, variant.guidance, variant.split, variant.scenario)
         if run.stop.is_set():
             raise Cancelled
         return simulate(
@@ -321,6 +321,11 @@ class Worker:
             sampling=Sampling(variant.temperature, variant.top_k),
             observe=observe,
         )
+
+    @torch.no_grad()
+    def _encode(self, model: str, guidance: float, split: str, scenario_id: str) -> Any:
+        policy = with_guidance(self.session.model(model).policy, guidance)
+        return policy.encode(collate([self.session.scenario(split, scenario_id)]).to(get_device(policy)))
 
     def _score(self, run: Run, v: int) -> None:
         simulated, body = run.simulated[v], run.body
@@ -336,11 +341,6 @@ class Worker:
         for variant in (v, *with_goals):
             base = run.simulated[free].scored.get(key) if variant != free else None
             run.tell("score", variant=variant, **run.simulated[variant].scored[key].to_payload(base))
-
-
-@torch.no_grad()
-def _encode(policy: Any, batch: ScenarioBatch) -> Any:
-    return policy.encode(batch)
 
 
 def as_json(event: tuple[str, dict[str, Any]]) -> str:

@@ -15,11 +15,11 @@ from starlette.types import ASGIApp
 
 from rlftsim.errors import RlftsimError
 from rlftsim.goals.goals_file import GoalEntry, parse_goals
+from rlftsim.studio import Refusal
 from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, Metric, OpenGoalsBody, RunBody, SaveGoalsBody
 from rlftsim.studio.exports import export, save_goals
 from rlftsim.studio.guard import Access, Guard
-from rlftsim.studio.imported import encode_imported, score_imported
-from rlftsim.studio.refusal import Refusal
+from rlftsim.studio.inputs import encode_imported, score_imported
 from rlftsim.studio.runs import Run, Worker, as_json
 from rlftsim.studio.session import Session
 from rlftsim.studio.variants import to_goal_entries
@@ -61,10 +61,8 @@ def create_app(session: Session, worker: Worker, access: Access) -> ASGIApp:
         access: Hosts and token that requests have to show.
     """
     app = FastAPI(title="rlftsim studio", docs_url=None, redoc_url=None, openapi_url=None)
-    app.add_exception_handler(RlftsimError, _answer_error)
-    app.add_exception_handler(RequestValidationError, _answer_invalid)
-    app.add_exception_handler(HTTPException, _answer_http)
-    app.add_exception_handler(Exception, _answer_failure)
+    for error_type in (RlftsimError, RequestValidationError, HTTPException, Exception):
+        app.add_exception_handler(error_type, _answer)
     _add_page(app)
     _add_scenarios(app, session)
     _add_runs(app, worker)
@@ -241,23 +239,20 @@ def _to_payload(entries: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
     return [{"scenario": e.scenario_id, "agent": e.agent_id, "x": e.x, "y": e.y, "label": e.label} for e in entries]
 
 
-async def _answer_error(_: Request, error: Exception) -> Response:
-    status, hint = (error.status, error.hint) if isinstance(error, Refusal) else (422, "")
-    return JSONResponse({"error": str(error), "hint": hint}, status)
-
-
-async def _answer_invalid(_: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    location = ".".join(str(step) for step in first["loc"] if step not in ("body", "query"))
-    return JSONResponse({"error": f"{location or 'body'}: {first['msg']}", "hint": ""}, 422)
-
-
-async def _answer_http(_: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    return JSONResponse({"error": str(error.detail), "hint": ""}, error.status_code)
-
-
-async def _answer_failure(_: Request, error: Exception) -> Response:
-    # The server still raises it, so that the terminal has the traceback.
-    return JSONResponse({"error": f"{type(error).__name__}: {error}; the terminal shows more.", "hint": ""}, 500)
+async def _answer(_: Request, error: Exception) -> Response:
+    """Answer to a request that failed: a sentence, and a hint where there is one."""
+    status, sentence, hint = 422, str(error), ""
+    match error:
+        case Refusal():
+            status, hint = error.status, error.hint
+        case RlftsimError():
+            pass
+        case RequestValidationError():
+            first = error.errors()[0]
+            location = ".".join(str(step) for step in first["loc"] if step not in ("body", "query"))
+            sentence = f"{location or 'body'}: {first['msg']}"
+        case HTTPException():
+            status, sentence = error.status_code, str(error.detail)
+        case _:  # the server still raises it, so that the terminal has the traceback
+            status, sentence = 500, f"{type(error).__name__}: {error}; the terminal shows more."
+    return JSONResponse({"error": sentence, "hint": hint}, status)

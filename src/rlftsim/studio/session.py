@@ -2,34 +2,31 @@
 
 import json
 import re
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import lru_cache
+from operator import eq, ge, gt, le, lt, ne
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import DataError
 from rlftsim.experiments.goal_proposals import format_label, propose, to_goal_entry
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.maneuvers.proposals import no_proposal_reason
 from rlftsim.goals.placement import goal_warnings
 from rlftsim.goals.types import simulated_track
 from rlftsim.jobs.folder import check_folder
-from rlftsim.policies.registry import Device, load_policy, with_guidance
-from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, is_goal_conditioned
+from rlftsim.policies.registry import Device
 from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
-from rlftsim.studio.imported import Imported, import_rollouts
-from rlftsim.studio.refusal import Refusal
+from rlftsim.studio import Refusal
+from rlftsim.studio.inputs import Imported, Model, import_rollouts, load_models
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
 ROWS_PER_PAGE = 200
-KEPT_SCENES, KEPT_CONTEXTS = 48, 8
+KEPT_SCENES = 48
 FIELDS = {
     "id": "scenario_id",
     "ego_turn": "ego_maneuver",
@@ -46,60 +43,7 @@ FIELDS = {
 MODEL_FIELDS = ("name", "source", "fingerprint", "takes_goals", "can_guide", "note")
 """Fields of `Model` that the page gets."""
 _TERM = re.compile(r"^(\w+)(<=|>=|!=|=|<|>)(.+)$")
-_COMPARE: dict[str, Callable[[Any, Any], bool]] = {
-    "=": lambda a, b: a == b,
-    "!=": lambda a, b: a != b,
-    "<": lambda a, b: a < b,
-    ">": lambda a, b: a > b,
-    "<=": lambda a, b: a <= b,
-    ">=": lambda a, b: a >= b,
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """A policy under the name that the page shows."""
-
-    name: str
-    source: str
-    """As given on the command line."""
-    policy: Policy
-    fingerprint: str
-    takes_goals: bool
-    note: str
-    """Reason for controls that are switched off; empty where all work."""
-    can_guide: bool
-
-
-class Recent:
-    """The most recently used values by key; safe in threads.
-
-    Args:
-        size: Number of values to keep; the least recently used values go first.
-    """
-
-    def __init__(self, size: int) -> None:
-        self.size = size
-        self._lock = Lock()
-        self._values: OrderedDict[Hashable, Any] = OrderedDict()
-
-    def get(self, key: Hashable, compute: Callable[[], Any]) -> Any:
-        """Value of a key; a missing value is computed.
-
-        Args:
-            key: Hashable key, such as (split, scenario id).
-            compute: Function without arguments that makes the value; two threads may both compute a missing value.
-        """
-        with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-                return self._values[key]
-        value = compute()
-        with self._lock:
-            self._values[key] = value
-            while len(self._values) > self.size:
-                self._values.popitem(last=False)
-        return value
+_COMPARE = {"=": eq, "!=": ne, "<": lt, ">": gt, "<=": le, ">=": ge}
 
 
 class Session:
@@ -133,11 +77,12 @@ class Session:
         check_folder(out, "results")
         self.out = out
         self._imported = import_rollouts(rollouts)
-        self.models = {model.name: model for model in _load(models, device)}
+        self.models = {model.name: model for model in load_models(models, device)}
         self._rows: dict[str, list[dict[str, Any]]] = {}
-        self._scenes, self._proposals = Recent(KEPT_SCENES), Recent(KEPT_SCENES * 8)
-        self.contexts = Recent(KEPT_CONTEXTS)
-        """Encoded scenarios by (model, split, scenario)."""
+        self._encoded_scene = lru_cache(KEPT_SCENES)(lambda *names: _encode_scene(self.scenario(*names)))
+        self._described_proposals = lru_cache(KEPT_SCENES * 8)(
+            lambda *names, agent: _describe_proposals(self.scenario(*names), agent)
+        )
 
     def describe(self) -> dict[str, Any]:
         """Versions, models and data: facts for the page before a scenario is shown."""
@@ -225,8 +170,7 @@ class Session:
         Raises:
             Refusal: No such scenario (404).
         """
-        scenario = self.scenario(split, scenario_id)
-        return self._scenes.get((split, scenario_id), lambda: _encode_scene(scenario))
+        return self._encoded_scene(split, scenario_id)
 
     def proposals(self, split: str, scenario_id: str, agent: int) -> dict[str, Any]:
         """Maneuvers that an agent can do, with paths and goals.
@@ -240,9 +184,7 @@ class Session:
             Refusal: No such scenario (404).
             DataError: No such agent.
         """
-        scenario = self.scenario(split, scenario_id)
-        track = simulated_track(scenario, agent, "proposals")
-        return self._proposals.get((split, scenario_id, agent), lambda: _describe_proposals(scenario, track))
+        return self._described_proposals(split, scenario_id, agent=agent)
 
     def doubts(self, scenario: Scenario, goals: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
         """Refusal or doubts of each goal, in the words of `rlftsim goals check`.
@@ -260,29 +202,6 @@ class Session:
                 refusal = str(error)
             answers.append({"agent": entry.agent_id, "refused": refusal, "doubts": doubts})
         return answers
-
-
-def _load(names: tuple[str, ...], device: Device) -> list[Model]:
-    models: list[Model] = []
-    for source in names:
-        policy = load_policy(source, device)
-        path = Path(source)
-        # A run's model lies in run/model: the run's name says more.
-        name = path.resolve().parent.name if path.name == "model" else path.name or path.resolve().name
-        if any(model.name == name for model in models):
-            name = next(n for k in range(2, len(names) + 2) if all(m.name != (n := f"{name}-{k}") for m in models))
-        takes_goals = is_goal_conditioned(policy)
-        note = "" if takes_goals else f"{name} is not goal-conditioned: it was not trained to follow goals."
-        models.append(Model(name, source, policy, fingerprint_policy(policy), takes_goals, note, _can_guide(policy)))
-    return models
-
-
-def _can_guide(policy: Policy) -> bool:
-    try:
-        with_guidance(policy, 2.0)
-    except ConfigError:
-        return False
-    return True
 
 
 def _parse_term(term: str) -> Callable[[dict[str, Any]], bool]:
@@ -317,7 +236,8 @@ def _encode_scene(scenario: Scenario) -> bytes:
     return json.dumps(payload, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _describe_proposals(scenario: Scenario, track: int) -> dict[str, Any]:
+def _describe_proposals(scenario: Scenario, agent: int) -> dict[str, Any]:
+    track = simulated_track(scenario, agent, "proposals")
     proposals = propose(scenario, track)
     reason = "" if proposals else no_proposal_reason(scenario, track) or "no maneuver can be completed in time"
     descriptions = []
@@ -335,4 +255,4 @@ def _describe_proposals(scenario: Scenario, track: int) -> dict[str, Any]:
                 "doubts": list(goal_warnings(entry, scenario)),
             }
         )
-    return {"agent": int(scenario.tracks.object_id[track]), "reason": reason, "proposals": descriptions}
+    return {"agent": agent, "reason": reason, "proposals": descriptions}

@@ -7,8 +7,8 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.goals.types import Goals
 from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.studio import Refusal
 from rlftsim.studio.bodies import CheckBody, RunBody
-from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.session import Session
 
 

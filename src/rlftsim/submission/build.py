@@ -24,7 +24,6 @@ from rlftsim.jobs.files import (
     errors_name,
     remove_folder,
     remove_temporaries,
-    remove_temporaries_below,
     temporary_path,
     write_text,
 )
@@ -132,16 +131,18 @@ def build_archive(
         job.plan.claim(job.folder)
         shards = job.folder / _SHARDS
         shards.mkdir(exist_ok=True)
+        outputs = [
+            path for n in numbers for path in (shards / job.plan.shard_name(n), job.shard_path(n), job.receipt_path(n))
+        ]
         if lease.is_alone:
-            remove_temporaries_below(shards)
+            remove_temporaries(outputs)
         receipts = _Receipts(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
         _forecast(job, sum(not receipts.is_finished(n) for n in select_items(runner, numbers)))
         packed_shards = run_items(
             "submit", numbers, partial(_build_shard, job),
             format=receipts, lease=lease, runner=runner, show_progress=show_progress,
         )  # fmt: skip
-        remove_temporaries_below(shards)
-        remove_temporaries(job.folder / PLAN)
+        remove_temporaries([*outputs, job.folder / PLAN])
         join_shards(archive, shards, packed_shards, delete=is_deleting)
         lease.remove()
     return archive

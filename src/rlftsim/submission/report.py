@@ -92,7 +92,7 @@ class Report:
         """Write `submission.report.md` and `.json` beside the archive; returns both paths."""
         json_path, text_path = (report_path(archive, ending) for ending in ("json", "md"))
         for path in (json_path, text_path):
-            remove_temporaries(path)
+            remove_temporaries([path])
         write_text(text_path, self.as_text())
         write_text(json_path, json.dumps(asdict(self), indent=1) + "\n")
         return [text_path, json_path]

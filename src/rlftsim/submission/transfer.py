@@ -45,5 +45,5 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
             temporary_path(target).replace(target)
     finally:
         for target in paths:
-            remove_temporaries(target)
+            remove_temporaries([target])
     return paths

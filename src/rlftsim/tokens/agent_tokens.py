@@ -4,7 +4,7 @@ A agents, S steps at 10 Hz, K token steps. Token step k is the motion from step 
 K is 18 for a whole scenario, 2 where only the history is logged.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -12,14 +12,16 @@ from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.scenario.batch import Frame, ScenarioBatch, collate
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario, cached_on_scenario
 from rlftsim.tokens import catk_compat as catk_ops
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, box_of_class, class_of_type
 
 HISTORY_TOKENS = 2
 """Token steps up to the current step."""
 MAX_HEADING_STEP_RAD = 1.5
+MAX_START_ERROR_M = 0.3
+"""Mean distance of the corners from the log up to which a simulation begins where the history tokens end. Of 11 595
+agents of WOMD 99 % are below 0.17 m in the public vocabulary; all synthetic ones are below 0.18 m in the demo's."""
 _ROWS_PER_CHUNK = 512
 _ROWS_PER_CHUNK_ELSEWHERE = 1 << 12
 _CANDIDATES = 64
@@ -175,6 +177,38 @@ def tokenize_tracks(
         next_token_id = tokens_towards(next_pose, (position, heading), token_class, valid, vocabulary)
     logged_valid = tracks.valid[..., token_ends]
     return AgentTokens(token_id, position, heading, valid, logged_position, logged_heading, logged_valid, next_token_id)
+
+
+def restart_at_log(tokens: AgentTokens, batch: ScenarioBatch, vocabulary: Vocabulary) -> AgentTokens:
+    """History tokens of a simulation: agents whose last one ends off the log, by `MAX_START_ERROR_M`, start at the log.
+
+    No token leads where these went: they back up, or are faster than every token. They get the logged poses and the
+    token nearest to each motion between them, as agents with imposed states do. The others keep their bits.
+
+    Args:
+        tokens: Tokens of the batch's logged tracks, by the rules of the public code.
+        batch: Scenarios whose logged headings count, jumps included, and not those that tokens follow.
+        vocabulary: Motion tokens of each class.
+    """
+    history = AgentTokens(**{name: values[:, :, :HISTORY_TOKENS] for name, values in vars(tokens).items()})
+    token_ends = slice(STEPS_PER_TOKEN, CURRENT_STEP + 1, STEPS_PER_TOKEN)
+    position = history.logged_position
+    heading = torch.where(batch.valid[..., token_ends], batch.heading[..., token_ends], history.logged_heading)
+    size = class_boxes(batch.object_type)
+    token_box = box_corners(history.position[..., -1, :], history.heading[..., -1], *size)
+    error = (token_box - box_corners(position[..., -1, :], heading[..., -1], *size)).norm(dim=-1).mean(-1)
+    restarts = history.valid & (error > MAX_START_ERROR_M)[..., None]  # [B, A, K]
+    # the first token starts at the log anyway
+    goal, start = (position[..., 1:, :], heading[..., 1:]), (position[..., :-1, :], heading[..., :-1])
+    class_id = class_of_type(batch.object_type)[..., None].expand_as(goal[1])
+    next_id = tokens_towards(goal, start, class_id, restarts[..., 1:], vocabulary)
+    token_id = torch.cat([history.token_id[..., :1], next_id], -1)
+    return replace(
+        history,
+        token_id=torch.where(restarts, token_id, history.token_id),
+        position=torch.where(restarts[..., None], position, history.position),
+        heading=torch.where(restarts, heading, history.heading),
+    )
 
 
 Pose = tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]

@@ -13,8 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from rlftsim.geometry import rotate
 from rlftsim.scenario.batch import ScenarioBatch, compute_origin
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatureType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatureType, Scenario, cached_on_scenario
 
 SPACING_M = 0.5
 WINDOW = 11

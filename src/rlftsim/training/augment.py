@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError
-from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import read_goal_file, write_goal_file
-from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.goals.types import logged_goals
+from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.runner import Inline, Runner
@@ -88,8 +88,8 @@ def augment_goals(
         RunFolder(folder, config, inputs)
         goals = _GoalFiles(folder, config.scenarios_per_part)
         groups, work = group_positions(len(scenarios), goals.size), partial(_find_ends, policy, scenarios, config)
-        run_items("augment", groups, group_task(work, goals), format=goals, lease=lease, runner=runner)
-        remove_temporaries_below(folder)  # of processes that were killed
+        paths = run_items("augment", groups, group_task(work, goals), format=goals, lease=lease, runner=runner)
+        remove_temporaries([folder / "config.json", *paths])  # of processes that were killed
         lease.remove()
     return len(scenarios)
 

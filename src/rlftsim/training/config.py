@@ -5,6 +5,7 @@ A settings class is a frozen dataclass: a run stores it, a recipe has one for ea
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -132,6 +133,9 @@ class ValidationConfig:
     """Configuration of the meta-metric."""
     seed: int = 0
     """Of the choice and of the rollouts, the same at every validation."""
+    keep_best: bool = False
+    """The model of the run is that of the best validation: of the highest lower bound (95 %, one-sided) of its gain in
+    RMM over the start, scenario by scenario. False = the model of the last update."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -205,10 +209,14 @@ class AlarmConfig:
     """Rise of the fraction of evaluated agents that run a red light."""
     speed_drift_mps: float = 1.0
     """Change, either way, of the mean speed against that of the log at the same steps."""
+    stop: bool = False
+    """The run ends with the update at which an alarm is raised; False = it goes on with a warning."""
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_positive(self, tuple(vars(self)))
+        check_positive(
+            self, ("first_updates", "window", "min_ade_rise", "diversity_fall", "red_light_rise", "speed_drift_mps")
+        )
 
 
 @dataclass(frozen=True)
@@ -295,6 +303,7 @@ class FinetuneConfig:
     """After so many skipped updates the run stops with its last good checkpoint."""
     goals: GoalConfig = field(default_factory=GoalConfig)
     alarms: AlarmConfig = field(default_factory=AlarmConfig)
+    validation: ValidationConfig = field(default_factory=partial(ValidationConfig, keep_best=True))
     checkpoint_every: int = 50
     """Updates."""
     seed: int = 0

@@ -12,9 +12,8 @@ from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.mirror import mirror_scenario
-from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
+from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios, cached_on_scenario
 
 MIN_FUTURE_STEPS = 5
 """Logged steps after the current one that an agent needs to be learned from."""

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import StoredGoals
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, logged_goals
 from rlftsim.jobs.progress import log
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, is_goal_conditioned

@@ -151,6 +151,8 @@ class UpdateReport:
     """Reason why the optimizer's step was skipped."""
     warnings: Sequence[str] = ()
     """Messages for the user, such as alarms."""
+    stop_because: str = ""
+    """Reason why the run ends with this update."""
 
 
 @dataclass(frozen=True, eq=False)

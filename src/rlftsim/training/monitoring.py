@@ -18,12 +18,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -137,19 +138,9 @@ class Alarms:
         return {f"{name}.{key}": value for name, mean in self.means.items() for key, value in vars(mean).items()}
 
     def load_numbers(self, numbers: Mapping[str, float]) -> None:
-        """Take back the numbers of a checkpoint.
-
-        Raises:
-            CheckpointError: A number is missing.
-        """
+        """Take back the numbers of a checkpoint, which has all that `to_numbers` names."""
         for name in self.means:
-            try:
-                start, now, count = (numbers[f"{name}.{key}"] for key in ("start", "now", "count"))
-            except KeyError as error:
-                raise CheckpointError(
-                    f"progress.json of the newest checkpoint lacks {error}: delete its folder, the run resumes from an "
-                    "older one."
-                ) from None
+            start, now, count = (numbers[f"{name}.{key}"] for key in ("start", "now", "count"))
             # JSON has one kind of number here: all are floats.
             self.means[name] = Running(start, now, int(count))
 
@@ -187,22 +178,62 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
         check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
 
 
+class Validator:
+    """Validations of a run, each on the same scenarios with the same dice.
+
+    Args:
+        scenarios: Held-out scenarios to select from, with futures.
+        config: Number and choice of scenarios and rollouts.
+        fabric: Processes of the run, which divide the scenarios.
+        start: Policy at the start of the run, to which gains refer; None = no gains are logged.
+
+    Raises:
+        DataError: A scenario withholds its future.
+    """
+
+    def __init__(self, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric, start: nn.Module | None = None):
+        self._scenarios, self.config, self._fabric = scenarios, config, fabric
+        clusters = getattr(scenarios, "clusters", np.arange(len(scenarios)))  # lists of scenarios name none
+        self._clusters = np.array(clusters)[config.choose(len(scenarios))]
+        self._start = None if start is None else validate(start, scenarios, config, fabric)[1]
+
+    def validate(self, model: nn.Module) -> dict[str, float]:
+        """Metrics of a model, see `validate`; with the gain in RMM over the start, and the lower bound of the gain.
+
+        Args:
+            model: Policy in training; left unchanged.
+        """
+        from rlftsim.statistics import cluster_bootstrap, mean_interval  # as in `validate`
+
+        values, rmm = validate(model, self._scenarios, self.config, self._fabric)
+        if self._start is not None:
+            gains = rmm - self._start
+            gain = mean_interval(gains, alpha=0.1)
+            if 1 < len(set(self._clusters)) < len(gains):
+                gain = cluster_bootstrap(gains, self._clusters, level=0.9)
+            values |= {"validation_gain": gain.mean, "validation_gain_low": gain.interval[0]}
+        return values
+
+
 @torch.no_grad()
-def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric) -> dict[str, float]:
+def validate(
+    model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric
+) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
     """Mean realism of a model's rollouts, and the use of the map; each process takes a part of the scenarios.
 
     Args:
-        model: a policy; left unchanged, training mode included.
+        model: Policy; left unchanged, training mode included.
         scenarios: Held-out scenarios to select from, with futures.
-        config: number and choice of scenarios and rollouts.
+        config: Number and choice of scenarios and rollouts.
         fabric: Processes of the run, over which sums are added.
 
     Returns:
-        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
-        predicts tokens the loss and map use on vehicles (`MapUse`), and the seconds taken.
+        1. Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
+           predicts tokens the loss and map use on vehicles (`MapUse`), and the seconds taken.
+        2. Meta-metric of each selected scenario; NaN where undefined.
 
     Raises:
-        DataError: a scenario withholds the future.
+        DataError: A scenario withholds the future.
     """
     from rlftsim.statistics import interval_around  # scipy.stats: half a second that configurations need not pay
 
@@ -210,7 +241,10 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     # A copy, so that neither the mode nor a cache of the model in training changes.
     frozen: Any = copy.deepcopy(model).eval().requires_grad_(False)
     # Dealt out in turn: the same scenarios in total for any number of processes.
-    selected = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
+    choice = config.choose(len(scenarios))
+    selected = choice[fabric.global_rank :: fabric.world_size]
+    rmm = torch.zeros(len(choice), dtype=torch.float64, device=fabric.device)
+    positions = torch.arange(len(choice), device=fabric.device)[fabric.global_rank :: fabric.world_size]
     sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
     map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
     for first in range(0, len(selected), config.scenarios_per_pass):
@@ -223,6 +257,7 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
                 map_use += measure_map_use(frozen, batch)
         realism, _ = score_rollouts(batch, rollouts, config.metric)
         values = torch.stack([getattr(realism, name).double() for name in WATCHED.values()], -1)  # [B, metrics]
+        rmm[positions[first : first + config.scenarios_per_pass]] = values[:, 0]
         # A scenario may have no finite value of a metric: it is left out of that mean.
         finite = values.isfinite()
         values = torch.where(finite, values, 0.0)
@@ -235,7 +270,8 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     logged = dict(zip(WATCHED, mean.tolist())) | {"validation_rmm_low": low, "validation_rmm_high": high}
     if map_use is not None:
         logged |= MapUse(all_reduce_sum(map_use.sums, fabric)).to_metrics("validation_")
-    return {**logged, "seconds_validation": time.perf_counter() - start}
+    rmm = all_reduce_sum(rmm, fabric).cpu().numpy()
+    return {**logged, "seconds_validation": time.perf_counter() - start}, rmm
 
 
 # ---- map use -------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.index_row import AGENT_COLUMNS, compute_index_row
+from rlftsim.scenario.shards import AGENT_COLUMNS, compute_index_row
 from rlftsim.scenario.types import TOTAL_STEPS, Scenarios
 from rlftsim.training.config import DeviceConfig
 
@@ -292,12 +292,12 @@ def count_columns(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndar
 
     Args:
         scenarios: a data set, or scenarios of other types, which are counted here.
-        columns: fields of `IndexRow` that are numbers.
+        columns: Names in `INDEX_FIELDS` of columns with numbers.
     """
     if isinstance(scenarios, ScenarioDataset):
         return np.array([scenarios.index[name].to_pylist() for name in columns], dtype=np.int64)
     rows = [compute_index_row(scenarios[i], "") for i in range(len(scenarios))]
-    return np.array([[getattr(row, name) for row in rows] for name in columns], dtype=np.int64)
+    return np.array([[row[name] for row in rows] for name in columns], dtype=np.int64)
 
 
 def check_scored(scenarios: Scenarios) -> None:

@@ -73,6 +73,7 @@ class RewardMethod(Method[FinetuneConfig]):
 
     settings = FinetuneConfig
     title = "fine-tune"
+    validates = True
 
     def describe(self, settings: FinetuneConfig) -> str:
         """The reward."""
@@ -92,7 +93,8 @@ class RewardMethod(Method[FinetuneConfig]):
         """One `update_policy`, with the resulting messages."""
         config = learner.config
         values = update_policy(learner, scenarios.batch(config.num_rollouts), config, fabric)
-        levels, alarms = learner.alarms.watch(values, config.alarms)
+        levels, raised = learner.alarms.watch(values, config.alarms)
+        alarms = [*raised]
         if learner.update == 1 and (values["reward_zero_rate"] == 1 or values["gradient_norm"] == 0):
             alarms.append(f"no reward reached a trained weight (RMM {values['rmm']:.3f})")
         for term in parse_reward(config.reward):
@@ -105,7 +107,8 @@ class RewardMethod(Method[FinetuneConfig]):
         if not math.isfinite(values["gradient_norm"]):
             cause = "its gradient is not finite"
         note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}"
-        return UpdateReport({**values, **levels}, note, cause, alarms)
+        stop_because = f"{raised[0]}" if config.alarms.stop and raised else ""
+        return UpdateReport({**values, **levels}, note, cause, alarms, stop_because)
 
 
 def prepare(

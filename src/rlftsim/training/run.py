@@ -6,7 +6,7 @@ leaves files through `training.run_folder`.
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.config import ValidationConfig
 from rlftsim.training.data import share_cache
 from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
-from rlftsim.training.monitoring import check_validation, validate
+from rlftsim.training.monitoring import Validator, check_validation
 from rlftsim.training.parallel import Fabric, all_reduce_sum, count_processes, forks_processes, num_sharing_memory
 from rlftsim.training.processes import linked_processes
 from rlftsim.training.registry import find_method
@@ -36,10 +36,13 @@ from rlftsim.training.run_folder import (
     newest_checkpoint,
     parse_update,
     read_checkpoint,
+    read_metrics,
     stored_settings,
     write_checkpoint,
 )
 
+STOPPED = "stopped"
+"""Number of a checkpoint that says that the run ended there by itself."""
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a run takes: a data set, a list, or a single scenario."""
 
@@ -81,8 +84,8 @@ def train_policy(
         raise ConfigError(f"{type(settings).__name__} are settings of no training method: `rlftsim recipe` lists some.")
     if held_out is not None and not method.validates:
         raise ConfigError(
-            f"held_out has no effect: {method.title} does not validate, but of the methods of fine-tuning CAT-K and "
-            "RoaD do."
+            f"held_out has no effect: {method.title} does not validate, but of the methods of fine-tuning rlft, "
+            "CAT-K and RoaD do."
         )
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
@@ -116,19 +119,27 @@ def _make_updates(
     validation: ValidationConfig | None = None if held_out is None else settings.validation
     if held_out is not None and validation is not None and validation.every:
         check_validation(policy, held_out, validation)
+    else:
+        validation = None
     learner = method.start(policy, scenarios, settings, fabric)
     update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     with _hold_folder(out, fabric):
         run = TrainingRun(method.title, scenarios, out, settings, learner, fabric)
+        validator = None
+        if held_out is not None and validation is not None:
+            # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
+            validator = Validator(held_out, validation, fabric, learner.result if validation.keep_best else None)
         run.resume()
         with run.progress() as is_stopped:
             note = ""
             while learner.update < run.num_updates:
                 report = method.update(learner, update_scenarios, fabric)
-                if held_out is not None and validation and validation.is_due(learner.update, run.num_updates):
-                    report.values.update(validate(learner.result, held_out, validation, fabric))
+                ends = learner.update == run.num_updates or bool(report.stop_because)
+                if validator and (ends or validator.config.is_due(learner.update, run.num_updates)):
+                    report.values.update(validator.validate(learner.result))
                     note = f", RMM {report.values['validation_rmm']:.3f}"
-                is_last = learner.update == run.num_updates or is_stopped()
+                    run.keep_best(report.values)
+                is_last = ends or is_stopped()
                 run.finish_update(replace(report, note=report.note + note), is_last=is_last)
                 if is_last:
                     break
@@ -185,6 +196,8 @@ class TrainingRun:
         inputs = {**describe_inputs(learner.policy, self.scenarios), **learner.inputs}
         self.folder = RunFolder(self.out, self.settings, inputs, writes=is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
+        self._best: tuple[float, int] | None = None
+        """Lower bound of the gain in the best validation so far, and its update."""
         # Such a run ends with nearly its initial weights, which looks like a method that does not work.
         if self.num_updates < self.settings.warmup_updates and is_first:
             log.warning(
@@ -206,11 +219,15 @@ class TrainingRun:
                 f"{self.num_updates} updates: raise epochs again to go on with it, or name another --out.{shorter}"
             )
         if newest:
-            progress = read_checkpoint(newest, learner.modules, learner.optimizer)
+            progress = read_checkpoint(newest, learner.modules, learner.optimizer, learner.to_numbers())
             learner.update = progress.update
             learner.load_numbers(progress.numbers)
+            if progress.numbers.get(STOPPED) and not self.folder.grows_from:
+                self.num_updates = learner.update
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
+        for values in read_metrics(self.folder.path):
+            self._choose_best(values)
         if self.fabric.is_global_zero and learner.update < self.num_updates:
             for name, value in self.folder.grows_from.items():
                 log.info(f"{self.folder.model} stays the model of {value:g} {name} until the run ends.")
@@ -241,6 +258,23 @@ class TrainingRun:
             stop.args = (f"continues behind update {parse_update(newest)}" if newest else "starts anew",)
             raise
 
+    def keep_best(self, values: Mapping[str, float]) -> None:
+        """Keep the weights if this is the best validation so far.
+
+        Args:
+            values: Metrics of the update, those of its validation included.
+        """
+        if self._choose_best({**values, "update": self.learner.update}) and self.fabric.is_global_zero:
+            self.folder.write_best(self.learner.update, self.learner.result)
+
+    def _choose_best(self, values: Mapping[str, float]) -> bool:
+        """Compare a validation with the best so far; True if it is better."""
+        bound = values.get("validation_gain_low", math.nan)
+        if math.isfinite(bound) and (self._best is None or bound > self._best[0]):
+            self._best = bound, int(values["update"])
+            return True
+        return False
+
     def finish_update(self, report: UpdateReport, *, is_last: bool) -> None:
         """Log an update, and write a checkpoint if due.
 
@@ -260,11 +294,16 @@ class TrainingRun:
                 log.warning(f"update {learner.update} skipped: {report.skipped_because} ({limit})")
             for warning in report.warnings:
                 log.warning(f"update {learner.update}, {warning}")
+            if report.stop_because:
+                log.warning(f"the run ends at update {learner.update} of {self.num_updates}: {report.stop_because}")
         # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
         is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
         self._check_divergence(report, has_checked_weights=is_due)
+        is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
+        self._check_divergence(report, has_checked_weights=is_due)
         if is_due and self.fabric.is_global_zero:
-            progress = Progress(learner.update, learner.to_numbers())
+            numbers = learner.to_numbers() | ({STOPPED: 1.0} if report.stop_because else {})
+            progress = Progress(learner.update, numbers)
             write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
         self._advance(note=report.note)
 
@@ -288,6 +327,7 @@ class TrainingRun:
         """
         learner = self.learner
         learner.finish()
+        self._take_best()
         self.folder.close()
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds
@@ -295,6 +335,20 @@ class TrainingRun:
         if self.fabric.is_global_zero:
             learner.policy.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model
+
+    def _take_best(self) -> None:
+        """Load the weights of the best validation, where one was kept and later updates were made."""
+        learner = self.learner
+        if self._best is None or self._best[1] == learner.update:
+            return
+        bound, update = self._best
+        if not self.folder.load_best(update, learner.result):
+            return
+        if self.fabric.is_global_zero:
+            log.info(
+                f"{self.folder.model} is the model of update {update}: its gain in RMM over the start is at least "
+                f"{bound:+.4f} (95 %, one-sided)."
+            )
 
 
 def _count_weights(learner: Learner) -> str:

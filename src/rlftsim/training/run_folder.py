@@ -4,6 +4,7 @@ config.json        the settings, every default filled in
 environment.json   versions, machine, command, commit
 metrics.jsonl      a line per update; also as TensorBoard events in tensorboard/
 checkpoints/       all that the run resumes from, see `write_checkpoint`
+best/              weights behind the best validations, where the best is kept
 model/             the trained policy, once the run is done (`save_pretrained`)
 """
 
@@ -194,6 +195,32 @@ class RunFolder:
         """True once a run has ended here."""
         return (self.model / "config.json").exists()
 
+    def write_best(self, update: int, model: nn.Module) -> None:
+        """Keep the weights of the best validation so far.
+
+        Args:
+            update: Number of updates behind which they were validated.
+            model: Module with the weights.
+        """
+        save_tensors(self._best(update), model.state_dict())
+
+    def load_best(self, update: int, model: nn.Module) -> bool:
+        """Load kept weights in place; False where an earlier start of the run had validated without keeping them.
+
+        Args:
+            update: Number of updates behind which they were validated.
+            model: Module that gets the weights.
+        """
+        try:
+            weights, _ = read_tensors(self._best(update), "train again", error=CheckpointError)
+        except FileNotFoundError:
+            return False
+        model.load_state_dict(weights)
+        return True
+
+    def _best(self, update: int) -> Path:
+        return self.path / "best" / f"update-{update:08d}.safetensors"
+
     def finish(self) -> None:
         """Store the settings of a run that was made longer; until then the stored settings belong to the earlier model.
 
@@ -364,13 +391,16 @@ def parse_update(path: Path) -> int:
     return int(path.name.removeprefix(PREFIX))
 
 
-def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> Progress:
+def read_checkpoint(
+    path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, names: Collection[str] = ()
+) -> Progress:
     """Load weights and moments in place.
 
     Args:
         path: Folder of the checkpoint, named after the update.
         modules: Modules by the names that `write_checkpoint` got; weights are loaded in place.
         optimizer: Optimizer with the same parameters in the same order; the learning rate stays.
+        names: Names of the numbers that the progress must have.
 
     Returns:
         The position of the run.
@@ -384,7 +414,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         # everything is checked before anything is loaded
         weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
         moments = _read(path / "optimizer.safetensors", way_out)
-        _check_progress(values, parse_update(path))
+        _check_progress(values, parse_update(path), names)
         for name, module in modules.items():
             _check_weights(name, weights[name], module)
         state = _parse_moments(moments, optimizer)
@@ -406,7 +436,7 @@ def _read(path: Path, way_out: str) -> dict[str, Tensor]:
         raise CheckpointError(f"{path} is missing: {way_out}.") from None
 
 
-def _check_progress(values: Mapping[str, Any], update: int) -> None:
+def _check_progress(values: Mapping[str, Any], update: int, names: Collection[str]) -> None:
     """Check the position of a run against the name of the folder.
 
     Raises:
@@ -417,6 +447,8 @@ def _check_progress(values: Mapping[str, Any], update: int) -> None:
     numbers = values.get("numbers")
     if not isinstance(numbers, dict) or not all(type(v) in (int, float) and math.isfinite(v) for v in numbers.values()):
         raise ValueError("its numbers are not finite numbers by name")
+    if missing := [name for name in names if name not in numbers]:
+        raise ValueError(f"its progress lacks the number {missing[0]}")
 
 
 def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) -> None:

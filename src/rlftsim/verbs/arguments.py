@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rlftsim.recipes.base import Recipe
     from rlftsim.rollout.policy import Policy
     from rlftsim.rollout.types import Rollouts
-    from rlftsim.scenario.any_form import AnyScenarios
+    from rlftsim.scenario.open import AnyScenarios
     from rlftsim.tokens.clustering import TokensConfig
     from rlftsim.training.method import TrainingSettings
 

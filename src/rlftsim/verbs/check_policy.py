@@ -2,7 +2,7 @@
 
 from rlftsim.rollout.check import CheckReport
 from rlftsim.rollout.check import check_policy as check_contract
-from rlftsim.scenario.any_form import to_scenarios
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Model
 from rlftsim.verbs.inputs import to_policy
 

@@ -237,7 +237,9 @@ COMMANDS = {
         "rlftsim.verbs.finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
         "print_model", FINETUNING,
     ),
+    "runs": Command("rlftsim.verbs.runs:runs", ("folders",), show="print_runs"),
     "augment": Command("rlftsim.verbs.augment:augment", ("model",)),
+    "models": Command("rlftsim.verbs.model:list_models"),
     "model show": Command("rlftsim.verbs.model:show_model", ("model",)),
     "model average": Command("rlftsim.verbs.model:average_models", ("models",)),
     "model import": Command("rlftsim.verbs.model:import_model", ("checkpoint",), names={"format": "from"}),
@@ -248,6 +250,8 @@ COMMANDS = {
         "rlftsim.verbs.simulate:simulate", ("policy",), ("out",), {**MODEL, "scenarios": "data"}, "print_rollouts"
     ),
     "drive": Command("rlftsim.verbs.drive:drive", ("planner",)),
+    "failures": Command("rlftsim.verbs.failures:failures", ("planner",)),
+    "failures show": Command("rlftsim.verbs.failures:show_failure", ("folder", "number")),
     "studio": Command("rlftsim.verbs.studio:studio"),
     "score": Command("rlftsim.verbs.score:score", ("rollouts",), show="print_scores"),
     "evaluate": Command("rlftsim.verbs.evaluate:evaluate", ("policy",), ("out",), MODEL, "print_evaluation"),

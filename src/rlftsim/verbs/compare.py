@@ -4,14 +4,13 @@ import os
 from typing import Any
 
 from rlftsim.errors import ConfigError
-from rlftsim.evaluation.compare import Comparison, format_comparison, format_table, select_columns
+from rlftsim.evaluation.compare import Comparison, format_comparison
 from rlftsim.evaluation.compare import compare as compare_evaluations
 from rlftsim.evaluation.drive_results import (
     DriveComparison,
     DriveResult,
     compare_drives,
     format_drive_comparison,
-    format_drives,
     is_drive_result,
 )
 from rlftsim.evaluation.results import Evaluation
@@ -55,8 +54,5 @@ def print_comparison(comparison: Comparison | DriveComparison) -> None:
     Args:
         comparison: Both results with their differences.
     """
-    if isinstance(comparison, DriveComparison):
-        print_wide(format_drives(comparison.a, comparison.b), format_drive_comparison(comparison))
-        return
-    evaluations = comparison.a, comparison.b
-    print_wide(format_table(*evaluations), format_comparison(comparison, columns=select_columns(*evaluations)))
+    is_drive = isinstance(comparison, DriveComparison)
+    print_wide(format_drive_comparison(comparison) if is_drive else format_comparison(comparison))

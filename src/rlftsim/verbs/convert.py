@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Machines, usable_cores
 from rlftsim.scenario.convert import convert as convert_source
 from rlftsim.scenario.tfrecord import count_lost
@@ -56,12 +57,12 @@ def convert(
     )
     by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
     counts = f"{report.converted} scenarios converted, {count_lost(report.skipped)} lost"
-    print(f"{report.destination}: {counts}; in all {by_split}.")
+    print_line(f"{report.destination}: {counts}; in all {by_split}.")
     for subject, count in report.tallies.items():
-        print(f"  {count} {subject}")
+        print_line(f"  {count} {subject}")
     # A damaged shard can lose thousands of records: the first ones are listed.
     for record in [*report.skipped, *report.duplicates][:MAX_LISTED]:
-        print(f"  left out: {record.file}, record {record.record}: {record.cause}")
+        print_line(f"  left out: {record.file}, record {record.record}: {record.cause}")
     num_hidden = len(report.skipped) + len(report.duplicates) - MAX_LISTED
     if num_hidden > 0:
         print(f"  ... and {num_hidden} more")

@@ -8,9 +8,9 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.buckets import is_url
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
-from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
 
 
@@ -25,7 +25,7 @@ def verify(data: str) -> int:
     _check_local(data)
     findings = verify_dataset(dataset_folder(data))
     for finding in findings:
-        print(finding)
+        print_line(finding)
     # Doubtful contents are in the logs themselves; only damage is an error.
     damaged = [finding for finding in findings if finding.problem.is_damage]
     print(f"{data}: {len(damaged)} damaged files, {len(findings) - len(damaged)} doubtful contents.")

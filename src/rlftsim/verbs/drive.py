@@ -3,8 +3,11 @@
 import sys
 from pathlib import Path
 
-from rlftsim.evaluation.drive_results import format_drives
-from rlftsim.jobs.progress import print_wide
+from rlftsim.evaluation.drive_results import FAILED, format_drives, format_worst, rank_scenarios
+from rlftsim.jobs.progress import print_line, print_wide
+
+MAX_WORST = 5
+"""Scenarios, and errors of a planner, that are printed."""
 
 
 def drive(
@@ -20,17 +23,18 @@ def drive(
     num_rollouts: int = 1,
     seed: int = 0,
     jobs: int = 1,
-    film: bool = False,
-) -> None:
+    film: str | None = None,
+) -> int:
     """Let a planner drive the ego of every scenario, and score the planner and the traffic around it.
 
-    Writes OUT/PLANNER-TRAFFIC.parquet for each kind of traffic, a row per scenario. `rlftsim compare` reads two of
+    Writes OUT/PLANNER-TRAFFIC.parquet for each type of traffic, a row per scenario. `rlftsim compare` reads two of
     them. An interrupted drive continues when the same command is repeated. Needs the extra env: pip install
     'rlftsim[env]'.
 
     Args:
         planner: Driver of the ego: replay, constant_velocity, idm, pdm, a planner of another package, or
-            package.module:Class.
+            package.module:Class, with options as in "careful:Careful(headway=1.0)". A planner that fails in a scenario
+            has no scores there.
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
         out: Folder for the results.
         model: Traffic model: a run, a model folder or a registered name.
@@ -41,7 +45,11 @@ def drive(
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.
         seed: Seed of the traffic. The same seed gives every planner the same dice.
         jobs: Processes, each with one thread. Changes no result.
-        film: Write OUT/SCENARIO.webp: the first scenario, its kinds of traffic side by side.
+        film: Scenarios to film, the types of traffic side by side: first, worst:N for the N lowest scores such as
+            worst:5, or failures for collisions at fault and driving off the road. Written to OUT/SCENARIO.webp.
+
+    Returns:
+        Exit status: 1 if the planner failed in a scenario, which then has no scores.
     """
     # Imported late: the environments need packages of an extra, and help does not.
     from rlftsim.envs import drive as driving
@@ -52,12 +60,22 @@ def drive(
         planner=planner, data=data, split=split, model=model,
         traffic=tuple(driver.strip() for driver in traffic.split(",")),
         num_rollouts=num_rollouts, seed=seed, limit=limit,
-        scenarios=tuple(scenario) if scenario else None, jobs=jobs,
+        scenarios=tuple(scenario) if scenario else None, jobs=jobs, film=film,
     )  # fmt: skip
     results = driving.drive(config, out)
-    print_wide(format_drives(*results))
+    worst = [scenario for scenario in rank_scenarios(results) if scenario.score < 1.0][:MAX_WORST]
+    print_wide(format_drives(*results), *([format_worst(worst)] if worst else []))
     for scenario_id, reasons in results[0].missing.items():
-        print(f"  {scenario_id}: {'; '.join(f'no {name}, {reason}' for name, reason in reasons.items())}")
-    if film:
-        print(driving.film(config, out))
+        missing = "; ".join(f"no {name}, {reason}" for name, reason in reasons.items() if name != FAILED)
+        if missing:
+            print_line(f"  {scenario_id}: {missing}")
+    for result in results:
+        failures, count = result.failures, len(result.table)
+        for message in list(failures.values())[:MAX_WORST]:
+            print_line(message)
+        if failures:
+            print(f"{result.name}: failed in {len(failures)} of {count} scenarios, which the means leave out.")
+    for scenario_id in driving.choose_films(results, film) if film is not None else ():
+        print(driving.film(config, scenario_id, out))
     print(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")
+    return int(any(result.failures for result in results))

@@ -10,14 +10,13 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.jobs.buckets import validate_folder
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Sampling
-from rlftsim.scenario.any_form import to_scenarios
-from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
 from rlftsim.verbs.inputs import to_policy, to_sampling
 
@@ -122,5 +121,5 @@ def print_evaluation(result: Evaluation, *, out: Path) -> None:
         raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
     print_wide(format_table(result))
     for skipped in result.skipped:
-        print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
+        print_line(f"  skipped {skipped.scenario_id}: {skipped.reason}")
     print(f"{out / result.name}.parquet")

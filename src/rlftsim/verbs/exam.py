@@ -10,10 +10,10 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
 from rlftsim.experiments.exam import CHECKOUT, LEDGER, ExamConfig, take_exam
 from rlftsim.experiments.exam_report import write_exam
 from rlftsim.experiments.ledger import Ledger
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import find_device
-from rlftsim.scenario.open import SYNTHETIC
+from rlftsim.scenario.dataset import SYNTHETIC
 from rlftsim.verbs.arguments import Device
 
 
@@ -82,7 +82,7 @@ def exam(
     tables, verdicts = write_exam(result, config, looks)
     print_wide(*(table.for_terminal() for table in tables))
     for line in verdicts:
-        print(f"* {line}")
+        print_line(f"* {line}")
     print(result.folder / "exam.md")
 
 

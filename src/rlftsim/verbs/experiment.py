@@ -10,11 +10,11 @@ from rlftsim.experiments.model_specs import VARIED
 from rlftsim.experiments.registry import PAPER, experiment_by_name
 from rlftsim.experiments.results import run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.jobs.progress import log, print_wide
+from rlftsim.jobs.progress import log, print_line, print_wide
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.base import Recipe
-from rlftsim.scenario.open import SYNTHETIC, dataset_folder
+from rlftsim.scenario.dataset import SYNTHETIC, dataset_folder
 from rlftsim.verbs.arguments import Device, Processes, RecipeOption
 from rlftsim.verbs.inputs import to_recipe
 
@@ -120,7 +120,7 @@ def experiment(
     result = run_experiment(name, planned, suite)
     print_wide(*(table.for_terminal() for table in result.tables))
     for line in result.verdicts:
-        print(f"* {line}")
+        print_line(f"* {line}")
     print(f"{out / name}.md")
 
 

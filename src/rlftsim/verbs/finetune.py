@@ -11,7 +11,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
 from rlftsim.rollout.policy import Policy
-from rlftsim.scenario.any_form import to_scenarios
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.training.config import (
     NOT_VALIDATED,
     CalibrateConfig,
@@ -118,8 +118,8 @@ def finetune(
             yes where goal conditioning is added, unchanged where the model has it.
         processes: Processes that train, in short for the method's device.processes.
         split: Split of the data set to train on.
-        validation_split: With catk and road: split to validate on in closed loop, see --catk.validation.every. Left
-            out: "validation", if the data set has it.
+        validation_split: With rlft, catk and road: split to validate on in closed loop, see
+            --finetune.validation.every. Left out: "tune", the part of "validation" that is not of the exam.
 
     Returns:
         The fine-tuned policy, ready to simulate.

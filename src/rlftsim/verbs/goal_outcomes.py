@@ -10,7 +10,7 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
 from rlftsim.goals.attainment import Outcome, measure_outcome
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
@@ -42,7 +42,7 @@ def report_outcomes(folder: Path, scenarios: Sequence[Scenario], goals: GoalsFil
     if outcomes:
         print_wide(outcome_table(outcomes))
     for path in pictures:
-        print(path)
+        print_line(path)
 
 
 def read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:

@@ -13,9 +13,9 @@ from rlftsim.goals.goals_file import GoalEntry, GoalsFile, check_single_goals, p
 from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
-from rlftsim.jobs.progress import log, print_wide
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_membership, dataset_folder
+from rlftsim.jobs.progress import log, print_line, print_wide
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
+from rlftsim.scenario.open import check_membership
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 from rlftsim.viewer.figure import check_picture_path
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
@@ -88,7 +88,7 @@ def propose_goals(
     # 3. files
     if picture is not None:
         draw_goals(picture, panels, columns=min(len(panels), 4))
-        print(picture)
+        print_line(picture)
     if out is not None:
         if not goals:
             labels = dict.fromkeys(entry.label for entry in alternatives)
@@ -140,7 +140,7 @@ def check_goals(file: Path, data: str) -> None:
         check_membership(scenarios, entry.scenario_id, data, entry)
         lines += goal_warnings(entry, scenarios.by_id(entry.scenario_id))
     for line in lines:
-        print(line)
+        print_line(line)
     counts = f"{len(goals.goals)} goals in {len(goals.scenario_ids)} scenarios, {len(goals.alternatives)} alternatives"
     print(f"{file}: {counts}, {len(lines)} doubts.")
 

@@ -11,10 +11,9 @@ from rlftsim.policies.registry import Device
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.rollout.policy import Policy, Sampling
-from rlftsim.scenario.any_form import Name, to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.open import Name, open_dataset, to_scenarios
 
 
 def load_dataset(name: Name, split: str | None = None) -> ScenarioDataset:

@@ -9,13 +9,14 @@ from torch import nn
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.folder import check_file
+from rlftsim.jobs.progress import print_line
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.checkpoint import read_card
-from rlftsim.policies.registry import load_policy
-from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
-from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
+from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import append_cards
+from rlftsim.recipes.docstrings import summarize_docstring
 
 Format = Literal["catk"]
 
@@ -39,7 +40,7 @@ def import_model(checkpoint: Path, vocabulary: list[Path], out: Path, *, format:
     weights = sum(p.numel() for p in imported.policy.parameters())
     print(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
     for note in imported.notes:
-        print(f"  {note}")
+        print_line(f"  {note}")
 
 
 def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
@@ -91,6 +92,18 @@ def average_models(models: list[str], out: Path, *, base: str | None = None, sca
     card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
     average.save_pretrained(out, card=append_cards(card, [*models, *filter(None, [base])]))
     print(f"model: {out}")
+
+
+def list_models() -> None:
+    """List the models that are used by their name alone: those in the box, baselines, and those of other packages.
+
+    Every command that takes MODEL takes these names, the folder of a run, or a model folder. `rlftsim model show NAME`
+    prints a card with data, scores and terms.
+    """
+    policies = {name: POLICIES.get(name) for name in POLICIES.names()}
+    summaries = {name: summarize_docstring(make) for name, make in policies.items() if needs_no_arguments(make)}
+    for name, summary in summaries.items():
+        print(f"{name:{max(map(len, summaries))}}  {summary}")
 
 
 def show_model(model: str) -> None:

@@ -7,7 +7,7 @@ from importlib.metadata import entry_points
 from rich.table import Table
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 
 POINTS = {
     "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
@@ -77,5 +77,5 @@ def plugins() -> int:
     print_wide(table)
     problems = [plug_in.problem for plug_in in plug_ins if plug_in.problem]
     for problem in problems:
-        print(problem)
+        print_line(problem)
     return int(bool(problems))

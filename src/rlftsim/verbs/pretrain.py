@@ -10,7 +10,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.policy import Policy, get_device
-from rlftsim.scenario.any_form import to_scenarios
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
@@ -111,8 +111,8 @@ def pretrain(
             those that its weights do not depend on, such as the number of neighbors. Left out: fresh weights.
         processes: Processes that train, in short for --pretrain.device.processes.
         split: Split of the data set to train on.
-        validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "validation",
-            if the data set has it.
+        validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "tune", the
+            part of "validation" that is not of the exam.
 
     Returns:
         The pre-trained policy, ready to simulate; a policy that was handed over stays as it is.

@@ -11,15 +11,14 @@ from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Unfinished, Work
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism import score as score_scenario
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.verbs.arguments import Data, File, ScoreMetric, Simulated
 from rlftsim.verbs.inputs import to_batch
@@ -177,4 +176,4 @@ def print_scores(result: Evaluation, *, json: bool = False) -> None:
         print_wide(format_scores(result))
     # On standard error, so that --json prints nothing but JSON.
     for skipped in result.skipped:
-        print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)
+        print_line(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)

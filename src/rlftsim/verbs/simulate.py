@@ -13,10 +13,10 @@ from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.evaluate import check_jobs, frozen_copy
 from rlftsim.evaluation.exporters import exporter_by_name
 from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
-from rlftsim.goals.maneuvers.reach import HORIZON_S
+from rlftsim.goals.maneuvers.lane_paths import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.progress import log, print_line, progress_bar
 from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -24,10 +24,9 @@ from rlftsim.rollout.policy import Policy, Sampling, get_device, is_goal_conditi
 from rlftsim.rollout.simulate import check_sampling
 from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.rollout.types import RolloutProvenance, Rollouts
-from rlftsim.scenario.any_form import to_scenarios
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import check_membership, open_dataset
+from rlftsim.scenario.open import check_membership, open_dataset, to_scenarios
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goal_outcomes import read_rollouts, report_outcomes
@@ -269,7 +268,7 @@ def _simulate_files(
     for exported in map(scenarios.by_id, ids if exporters else ()):
         states = read_rollouts(out, exported)
         for write in exporters:
-            print(write(exported, states, out))
+            print_line(write(exported, states, out))
     return paths
 
 

@@ -8,7 +8,7 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_
 from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.evaluation.score_files import format_scores
 from rlftsim.jobs.folder import check_file
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -199,7 +199,7 @@ def info(archive: Path, *, split_gb: float | None = None) -> int:
     if result.metadata is not None:
         for entry, value in result.metadata.ListFields():
             text = ", ".join(map(str, value)) if entry.is_repeated else str(value)
-            print(f"  {entry.name}: {shorten(text)}")
+            print_line(f"  {entry.name}: {shorten(text)}")
     if split_gb is not None:
         files = split_file(archive, split_gb)
         print(f"{len(files)} parts; join them with: cat {archive.name}.??? > {archive.name}")
@@ -209,7 +209,7 @@ def info(archive: Path, *, split_gb: float | None = None) -> int:
 def _print_findings(check: ArchiveCheck) -> None:
     """Print each finding, and what was checked."""
     for line in check.findings.lines():
-        print(line)
+        print_line(line)
     note = "" if check.num_checked == check.num_scenarios else f", trajectories of {check.num_checked} looked at"
     print(
         f"{check.archive}: {len(check.shards)} shards, {check.num_scenarios} scenarios{note}, "

@@ -9,7 +9,7 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_wide
-from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import read_catk_vocabulary
 from rlftsim.scenario.open import open_dataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.coverage import measure_coverage

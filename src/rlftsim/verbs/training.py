@@ -26,7 +26,8 @@ from rlftsim.training.run import train_policy
 from rlftsim.verbs.inputs import to_policy
 
 VALIDATION = "validation"
-"""Split that is validated on where none is named."""
+TUNE = "tune"
+"""Split that is validated on where none is named: the part of "validation" that is not of the exam."""
 
 
 def load_start(policy: Any) -> tuple[Policy, Any]:
@@ -125,7 +126,7 @@ def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset |
 
     Args:
         data: Training scenarios as they were handed over; only a data set has a split to validate on.
-        split: Split to validate on; None = "validation", where the data set has it.
+        split: Split to validate on; None = "tune", where the data set has a split "validation".
         every: Updates between two validations; 0 = none.
 
     Raises:
@@ -145,7 +146,7 @@ def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset |
     if split is None and VALIDATION not in list_splits(data):
         log.info(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
         return None
-    return open_dataset(data, split or VALIDATION)
+    return open_dataset(data, split or TUNE)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.files import write_text
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.any_form import AnyScenarios, to_scenarios
+from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, register_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories

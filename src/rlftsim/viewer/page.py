@@ -34,6 +34,8 @@ class Animation:
     scene: SceneView
     panels: Sequence[Panel]
     caption: str = ""
+    first_step: int | None = None
+    """Step that the player begins with, also after the end; None = the present, and after the end the history."""
 
     def __post_init__(self) -> None:
         if not self.panels:
@@ -72,8 +74,9 @@ def animation_html(animation: Animation) -> str:
     )
     caption = f'<p class="player-caption">{escape(animation.caption)}</p>' if animation.caption else ""
     note = f'<p class="player-caption">{escape(animation.scene.note)}</p>' if animation.scene.note else ""
+    first = "" if animation.first_step is None else f' data-first="{animation.first_step}"'
     return (
-        f'<figure class="player" tabindex="0" aria-label="{escape(animation.title)}">'
+        f'<figure class="player" tabindex="0" aria-label="{escape(animation.title)}"{first}>'
         f'<figcaption><div class="player-title">{escape(animation.title)}</div>{caption}</figcaption>'
         f'<div class="panels">{panels}</div>'
         f"{_controls_html()}{_legend_html(animation)}"

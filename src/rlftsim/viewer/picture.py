@@ -36,11 +36,7 @@ COLORS = {
 }
 ROLES = ("other", "evaluated", "ego")
 MIN_PEDESTRIAN_RADIUS_M = 0.5
-LIGHT_COLORS = {
-    **dict.fromkeys("147", "#c4161c"),
-    **dict.fromkeys("258", "#d9a514"),
-    **dict.fromkeys("36", "#11754b"),
-}
+LIGHT_COLORS = {**dict.fromkeys("147", "#c4161c"), **dict.fromkeys("258", "#d9a514"), **dict.fromkeys("36", "#11754b")}
 """Colors of stop, caution and go, by WOMD's numbers of a light's states."""
 MARK_STYLES = {"collides": "-", "offroad": "--"}
 """Line styles of the frames around agents, by the field of `SceneMotion` that marks them."""
@@ -50,15 +46,14 @@ NOTE_CHARACTERS = 75
 """Of a line of small print across one panel."""
 
 
-def to_png(
-    path: str | os.PathLike[str], animation: Animation, *, step: int = CURRENT_STEP, dots_per_inch: int = DOTS_PER_INCH
-) -> None:
-    """Draw the panels of an animation side by side, boxes at `step`, paths of evaluated agents from there on.
+def to_png(path: str | os.PathLike[str], animation: Animation, *, dots_per_inch: int = DOTS_PER_INCH) -> None:
+    """Draw the panels of an animation side by side at the current step, with the later paths of evaluated agents.
+
+    Boxes are those of each panel's first rollout.
 
     Args:
         path: File to write, .png, .svg or .pdf; no half-written file is left.
         animation: Scene and panels; the caption is left out.
-        step: Step 0..90 of the boxes, which are those of each panel's first rollout.
         dots_per_inch: Resolution of a PNG; 160 makes a panel 640 pixels wide.
 
     Raises:
@@ -67,9 +62,9 @@ def to_png(
     """
     figure, axes = draw_scene(animation)
     for axis, panel in zip(axes, animation.panels):
-        draw_paths(axis, animation.scene.agents, panel, step)
-        light_dots(axis, animation.scene, step)
-        for shape in agent_shapes(animation.scene.agents, panel, step):
+        draw_paths(axis, animation.scene.agents, panel)
+        light_dots(axis, animation.scene, CURRENT_STEP)
+        for shape in agent_shapes(animation.scene.agents, panel, CURRENT_STEP):
             axis.add_collection(shape, autolim=False)
     save_figure(Path(path), figure, dots_per_inch=dots_per_inch)
 
@@ -144,20 +139,20 @@ def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
     add(LineCollection, "edge", colors=COLORS["edge"], lw=1.1)
 
 
-def draw_paths(axis: Axes, agents: AgentBoxes, panel: Panel, step: int) -> None:
-    """Draw the paths of the evaluated agents as thin lines, paler the more rollouts there are.
+def draw_paths(axis: Axes, agents: AgentBoxes, panel: Panel) -> None:
+    """Draw the paths of the evaluated agents from the current step on as thin lines, paler the more rollouts there are.
 
     Args:
         axis: Axes in the map frame, meters.
         agents: Boxes of the scene, which say which agents are evaluated.
         panel: Motion of the agents in all rollouts.
-        step: First step of the paths, 0..90.
     """
     trajectories = panel.trajectories
+    position, valid = trajectories.position[:, :, CURRENT_STEP:], trajectories.valid[:, :, CURRENT_STEP:]
     alpha = max(0.12, 0.9 / np.sqrt(trajectories.num_rollouts))
     for agent in np.flatnonzero(agents.evaluated_mask):
         # [N, steps, 2]; NaN interrupts a line where the agent is not valid.
-        points = np.where(trajectories.valid[:, agent, step:, None], trajectories.position[:, agent, step:], np.nan)
+        points = np.where(valid[:, agent, :, None], position[:, agent], np.nan)
         color = COLORS[ROLES[2 if agents.is_ego[agent] else 1]]
         width = 2.0 if trajectories.num_rollouts == 1 else 1.0
         axis.add_collection(LineCollection(list(points), colors=color, lw=width, alpha=alpha), autolim=False)

@@ -105,7 +105,8 @@ class Player {
     const data = JSON.parse(root.querySelector("script[type='application/json']").textContent);
     this.scene = data.scene;
     this.map = buildMap(data.scene.map);
-    this.time = data.scene.now; this.rollout = 0; this.speed = 1; this.showAll = true;
+    this.first = Number(root.dataset.first ?? 0);
+    this.time = Number(root.dataset.first ?? data.scene.now); this.rollout = 0; this.speed = 1; this.showAll = true;
     this.playing = false; this.hovered = -1; this.held = 0;
     this.resetView();
     this.panels = [...root.querySelectorAll(".panel")].map((element, i) => new Panel(element, data.panels[i], this));
@@ -193,7 +194,7 @@ class Player {
     button.setAttribute("aria-label", playing ? "Pause" : "Play");
     button.classList.toggle("playing", playing);
     if (!playing) return;
-    if (this.time >= this.steps - 1) this.time = 0;
+    if (this.time >= this.steps - 1) this.time = this.first;
     this.last = performance.now();
     requestAnimationFrame((stamp) => this.tick(stamp));
   }
@@ -203,7 +204,7 @@ class Player {
     const elapsed = Math.min(Math.max((stamp - this.last) / 1000, 0), 0.25);
     this.last = stamp;
     if (this.time < this.steps - 1) this.seek(this.time + (elapsed * this.speed) / STEP_S);
-    else if ((this.held += elapsed) > HOLD_AT_END_S) { this.held = 0; this.seek(0); }
+    else if ((this.held += elapsed) > HOLD_AT_END_S) { this.held = 0; this.seek(this.first); }
     requestAnimationFrame((next) => this.tick(next));
   }
 

@@ -14,16 +14,61 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rlftsim.errors import DataError
+from rlftsim.geometry import boxes_overlap, heights_overlap
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.sources import find_attribution
-from rlftsim.scenario.types import (
-    CURRENT_STEP,
-    HISTORY_STEPS,
-    LightStates,
-    MapFeatureType,
-    Scenario,
-)
-from rlftsim.viewer.overlap import compute_overlap
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, MapFeatureType, Scenario
+
+
+def compute_overlap(
+    position: Float[np.ndarray, "N A S 2"],
+    heading: Float[np.ndarray, "N A S"],
+    length: Float[np.ndarray, "A"],
+    width: Float[np.ndarray, "A"],
+    valid: Bool[np.ndarray, "N A S"],
+    *,
+    ignore_from: int | None = None,
+    z: Float[np.ndarray, "N A S"] | None = None,
+    height: Float[np.ndarray, "A"] | None = None,
+) -> Bool[np.ndarray, "N A S"]:
+    """True where an agent's box has an inner point in common with a second box.
+
+    Args:
+        position: Centers [N, A, S, 2] of the boxes, meters.
+        heading: Headings [N, A, S], radians.
+        length: Lengths [A] along the heading, meters.
+        width: Widths [A] across the heading, meters.
+        valid: Mask [N, A, S]; an agent that is not valid overlaps no agent.
+        ignore_from: Step at which overlapping pairs are noted, never to be marked; None marks all pairs.
+        z: Heights [N, A, S] of the centers, meters; without heights, agents above each other overlap.
+        height: Heights [A] of the boxes, meters; needed with `z`.
+    """
+    overlap = np.zeros(valid.shape, bool)  # [N, A, S]
+    size = np.stack([length, width], axis=-1).astype(np.float64)
+    radius = np.linalg.norm(size, axis=-1) / 2  # [A], of the circle around a box
+    for n in range(len(valid)):
+        center = position[n].astype(np.float64)  # [A, S, 2]
+        for agent in range(len(size) - 1):
+            later_agents = slice(agent + 1, None)
+            gap = center[later_agents] - center[agent]  # [A - agent - 1, S, 2]
+            # Few pairs are so close that their circles touch; only these need the exact test.
+            is_close = (gap**2).sum(-1) < (radius[later_agents, None] + radius[agent]) ** 2
+            # k pairs of a later agent and a step
+            gap_row, step = np.nonzero(is_close & valid[n, later_agents] & valid[n, agent])
+            if not len(gap_row):
+                continue
+            row = gap_row + agent + 1
+            headings = heading[n, agent, step], heading[n, row, step]
+            hit = boxes_overlap(gap[gap_row, step], *headings, size[agent], size[row])
+            if z is not None and height is not None:
+                hit &= heights_overlap(z[n, row, step] - z[n, agent, step], height[agent, None], height[row])
+            if ignore_from is not None:
+                # A stroller and its pusher overlap from the beginning, which is no collision.
+                hit &= ~np.isin(row, row[hit & (step == ignore_from)])
+            overlap[n, agent, step[hit]] = True
+            overlap[n, row[hit], step[hit]] = True
+    return overlap
+
 
 SIMPLIFY_TOLERANCE_M = 0.1
 """Largest distance of a drawn map line from the logged one."""

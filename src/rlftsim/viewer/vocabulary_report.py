@@ -140,14 +140,13 @@ def _centimeters(spread: Spread) -> str:
     return f"{100 * spread.mean:.2f} · {100 * spread.p95:.2f} · {100 * spread.max:.1f}"
 
 
-def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: str, dots_per_inch: int = 110) -> None:
-    """Draw a row of three panels for each class.
+def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: str) -> None:
+    """Draw a row of three panels for each class, 17 inches wide.
 
     Args:
         path: PNG to write; no half-written file is left.
         classes: Coverage of each class of agents, the result of `measure_coverage`.
         title: Description of vocabulary and data above all panels.
-        dots_per_inch: Resolution of the PNG, which is 17 inches wide.
     """
     figure = Figure(figsize=(17, 4.3 * len(classes) + 0.6), layout="constrained")
     figure.suptitle(title, fontsize=13, fontweight="bold", x=0.01, ha="left", color=INK)
@@ -159,7 +158,7 @@ def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: s
         for axis in row:
             axis.spines[["top", "right"]].set_visible(False)
             axis.tick_params(labelsize=9)
-    save_figure(path, figure, dots_per_inch=dots_per_inch)
+    save_figure(path, figure, dots_per_inch=110)
 
 
 def _draw_tokens(figure: Figure, axis: Axes, coverage: ClassCoverage) -> None:

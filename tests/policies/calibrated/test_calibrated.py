@@ -9,8 +9,7 @@ import scenes
 import tiny
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.averaging import average_policies
-from rlftsim.policies.calibrated.distribution import TiltedDistribution
-from rlftsim.policies.calibrated.features import FEATURES, features_by_name, register_feature
+from rlftsim.policies.calibrated.features import FEATURES, TiltedDistribution, features_by_name, register_feature
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity

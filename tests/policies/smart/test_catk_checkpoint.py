@@ -12,9 +12,16 @@ from safetensors.torch import load_file, save_file
 
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError
-from rlftsim.policies.smart.catk_checkpoint import export_catk, import_catk, write_catk
-from rlftsim.policies.smart.catk_keys import PREFIX, find_aliases
-from rlftsim.policies.smart.catk_vocabulary import has_published_tokens, read_catk_vocabulary, write_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import (
+    PREFIX,
+    export_catk,
+    find_aliases,
+    has_published_tokens,
+    import_catk,
+    read_catk_vocabulary,
+    write_catk,
+    write_catk_vocabulary,
+)
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.tokens.vocabulary import Vocabulary

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rlftsim.policies.smart.dropout import Dropout, draw_dropout
+from rlftsim.policies.smart.attention import Dropout, draw_dropout
 
 
 @pytest.mark.parametrize("probability", [0.1, 0.25, 0.5])

@@ -18,7 +18,7 @@ import torch
 from torch.nn import functional
 
 from catk_loss import catk_loss
-from rlftsim.policies.smart.catk_keys import PREFIX, catk_name
+from rlftsim.policies.smart.catk_checkpoint import PREFIX, catk_name
 from rlftsim.scenario.batch import collate
 from rlftsim.training.catk_rollouts import roll_out_closest
 from rlftsim.training.data import within_reach

@@ -9,7 +9,7 @@ import scenes
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.smart.catk_checkpoint import write_catk
 from rlftsim.policies.smart.config import SmartConfig
-from rlftsim.policies.smart.heads import NEVER, ClassHeads, ContinuationScores
+from rlftsim.policies.smart.embeddings import NEVER, ClassHeads, ContinuationScores
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate

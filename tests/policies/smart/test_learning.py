@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import cross_entropy
 
 import scenes
-from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import read_catk_vocabulary
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate

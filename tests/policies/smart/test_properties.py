@@ -82,7 +82,7 @@ def features(policy, batch, turn_rad, shift_m, order=None):
         normalize(network.map_encoder(tokens, policy.vocabulary.map_prototypes.double())), class_id,
         network.decoder.embed_agents(class_id, batch.size.double()),
         network.decoder.embed_tokens(policy.vocabulary.end_corners().double()),
-        network.decoder.relations(),
+        **network.decoder.relations(),
     )  # fmt: skip
     return network.decoder.head(network.decoder(scene, steps, None)[0])
 

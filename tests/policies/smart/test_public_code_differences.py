@@ -13,7 +13,7 @@ from torch import nn
 
 import scenes
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.types import ObjectType
+from rlftsim.scenario.types import CURRENT_STEP, ObjectType
 from rlftsim.tokens.agent_tokens import tokenize_agents
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.map_tokens import tokenize_map
@@ -135,3 +135,17 @@ def test_with_label_smoothing_the_loss_of_a_perfect_model_is_not_zero(tmp_path):
     assert perfect["loss"] == pytest.approx(1.0874, abs=1e-3)
     assert perfect["accuracy"] == 1.0
     assert confident["loss"] > perfect["loss"]
+
+
+@pytest.mark.parametrize("catk_compat", [False, True])
+def test_a_simulation_of_a_car_that_backs_up_begins_where_its_log_ends(vocabulary, catk_compat):
+    batch = collate([scenes.build_scenario("back", (scenes.Mover(), scenes.Mover(x_m=30.0, speed_mps=-5.0)))])
+    policy = smart(vocabulary, catk_compat=catk_compat)
+    context = policy.encode(batch)
+    state = policy.begin(context, 1, None, torch.zeros(1, 1, 2, 0))
+    assert torch.equal(state.position[0, 0, 1], batch.position[0, 1, CURRENT_STEP])
+    assert torch.equal(state.heading[0, 0, 1], batch.heading[0, 1, CURRENT_STEP])
+    torch.testing.assert_close(context.history.motion[0, 0, 1, 1], torch.tensor([-2.5, 0.0]), atol=1e-3, rtol=0)
+    # pre-training sees what the public code sees: the car stands where it was at first
+    steps = policy._logged_steps(policy._tokenize(batch), slice(0, -1))
+    assert (steps.position[0, 0, 1, 1] - batch.position[0, 1, CURRENT_STEP]).norm() > 4

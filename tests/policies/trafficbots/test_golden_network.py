@@ -9,11 +9,18 @@ import pytest
 import torch
 from public_names import UNUSED
 
-from rlftsim.policies.trafficbots.attention import KeyValues, PolylineEncoder, PoseAttention
-from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
+from rlftsim.policies.trafficbots.attention import (
+    KeyValues,
+    Neighbors,
+    PolylineEncoder,
+    PoseAttention,
+    find_neighbors,
+    pose_embedding,
+    relative_pose,
+)
 from rlftsim.policies.trafficbots.network import Windows, agent_attributes, segment_features
-from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
 from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.policies.trafficbots.state import leaves_map, max_action, move, reaches_destination
 from rlftsim.rollout.policy import Sampling
 
 both = pytest.mark.parametrize("name", ["A", "B"])
@@ -73,7 +80,7 @@ def test_features_at_the_current_step(golden, small, scene, name):
     pooled = network.destination_predictor.windows(history, agent_attributes(scene))
     assert gap(pooled[0], theirs["destination/pooled"]) <= FEATURE
     windows = Windows(scene.valid[:, None, None], scene.pose[:, None, None], scene.motion[:, None, None])
-    agents = network.agents(windows, scene, network.agents.context(map_features, lights))
+    agents = network.agents(windows, network.agents.context(scene, map_features, lights))
     assert gap(agents[0, 0, 0], theirs["agent/feature"]) <= FEATURE
 
 
@@ -141,7 +148,7 @@ def test_the_default_size(golden, default, scene):
     context = default.encode_scene(scene)
     assert gap(context.map_features[0, ::8], theirs["map_feature_every8"]) <= 2e-5
     windows = Windows(scene.valid[:, None, None], scene.pose[:, None, None], scene.motion[:, None, None])
-    agents = network.agents(windows, scene, context.agent_context.select_steps(slice(0, 1)))
+    agents = network.agents(windows, context.agent_context.select_steps(slice(0, 1)))
     assert gap(agents[0, 0, 0], theirs["agent_feature"]) <= 2e-5
     history = Windows(scene.valid, scene.pose, scene.motion)
     destinations = network.destination_predictor(history, scene, context.map_features)

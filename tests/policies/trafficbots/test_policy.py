@@ -13,8 +13,8 @@ import scenes
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.trafficbots.config import trafficbots_demo
-from rlftsim.policies.trafficbots.dynamics import MAX_ACTION
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
+from rlftsim.policies.trafficbots.state import MAX_ACTION
 from rlftsim.rollout.check import check_policy
 from rlftsim.rollout.edge_scenes import edge_scenes
 from rlftsim.rollout.policy import ImitatedPolicy, PartlyTrainedPolicy, Sampling, SharingPolicy, TrainablePolicy

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import scenes
-from rlftsim.policies.trafficbots.destinations import (
+from rlftsim.policies.trafficbots.map_tokens import cut_line, sides_of_polygon, tokenize_lights, tokenize_map
+from rlftsim.policies.trafficbots.scene import (
     CYCLIST,
     NO_DESTINATION,
     VEHICLE,
     DestinationMap,
     _successors,
+    agent_motions,
+    build_scene,
     destination_labels,
 )
-from rlftsim.policies.trafficbots.map_tokens import cut_line, sides_of_polygon, tokenize_lights, tokenize_map
-from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import HISTORY_STEPS, TOTAL_STEPS, LightStates
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from public_names import UNUSED, our_names
 
-from rlftsim.policies.trafficbots.dynamics import max_action, move
-from rlftsim.policies.trafficbots.imitation import TrainingDraws, compute_scene_loss, imitation_terms, personality_kl
+from rlftsim.policies.trafficbots.imitation import Draws, compute_scene_loss, imitation_terms, personality_kl
+from rlftsim.policies.trafficbots.state import max_action, move
 
 pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")]
 TERMS = ("imitation", "personality", "destination", "light")
@@ -17,7 +17,7 @@ def test_loss_and_every_gradient(golden, small, scene, name, case):
     theirs, numbers = golden.arrays(f"scenario_{name}/train_{case}"), golden.scalars("train")[f"{name}_{case}"]
     scene, network = scene(name, "gt"), small.network
     labels = torch.from_numpy(golden.arrays(f"scenario_{name}/inputs")["dest_label"]).long()[None]
-    draws = TrainingDraws(
+    draws = Draws(
         noise=torch.from_numpy(theirs["eps"])[None],
         from_prior=False,
         forced=torch.from_numpy(theirs["forced"][:, 11:].any(1))[None],
@@ -26,7 +26,7 @@ def test_loss_and_every_gradient(golden, small, scene, name, case):
     )
     small.zero_grad()
     with torch.enable_grad():
-        found = compute_scene_loss(network, small.config, scene, labels, scene.agent_mask, draws)
+        found = compute_scene_loss(network, scene, labels, scene.agent_mask, draws)
         found.loss.backward()
     # 1. The loss, all of it and its terms.
     assert float(found.loss.detach()) == pytest.approx(numbers["loss"], rel=1e-6)

@@ -10,13 +10,11 @@ import scenes
 import tiny
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
-from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.imitation import compute_scene_loss, draw_training, imitation_terms
 from rlftsim.policies.trafficbots.network import Windows
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
-from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.state import ImposedStates, start_traffic
+from rlftsim.policies.trafficbots.scene import NO_DESTINATION, build_scene, destination_labels
+from rlftsim.policies.trafficbots.state import ImposedStates, max_action, move, start_traffic
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import TOTAL_STEPS
@@ -130,7 +128,7 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
         own = torch.from_numpy(destination_labels(scenario, None))
         row[: len(own)] = own
     draws = replace(draw_training(scene, SETTINGS, 0.3, hide=False), from_prior=False)
-    found = compute_scene_loss(network, SETTINGS, scene, labels, scene.agent_mask, draws)
+    found = compute_scene_loss(network, scene, labels, scene.agent_mask, draws)
     two_passes = torch.autograd.grad(found.loss, weights, allow_unused=True)
 
     # The imitation loss alone, step by step with gradient; the other terms are the same in both.
@@ -144,13 +142,13 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
     mean = network.posterior(logged, scene.light_state[:, None, :, ::5], scene, map_features)
     personality = mean + network.posterior.log_std.exp() * draws.noise
     given = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
-    around = network.agents.context(map_features, lights[:, 10:])
+    around = network.agents.context(scene, map_features, lights[:, 10:])
     traffic, limit = start_traffic(scene, labels[:, None]), max_action(scene.agent_class)[:, None]
     pose, speed = traffic.windows.pose[..., -1, :], traffic.windows.motion[..., -1, 0]
     losses, counted = [], []
     for step in range(11, 91):
         now = around.select_steps(slice(step - 11, step - 10))
-        features = network.features(traffic.windows.add_decision_axis(), scene, now, given, traffic.active[:, None])
+        features = network.features(traffic.windows.add_decision_axis(), now, given, traffic.active[:, None])
         action = network.mean_actions(features, scene)[:, 0]
         pose, motion = move(pose, speed, torch.where(traffic.alive[..., None], action, 0.0), limit)
         own_pose, own_motion = scene.pose[:, None, :, step], scene.motion[:, None, :, step]

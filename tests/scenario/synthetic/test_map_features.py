@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from rlftsim.scenario.synthetic.crop import MapCropper, cut_feature, on_grid
-from rlftsim.scenario.synthetic.ground import Ground
+from rlftsim.scenario.synthetic.crop import Ground, MapCropper, cut_feature, on_grid
 from rlftsim.scenario.synthetic.map_features import Feature, NetworkMap, oriented_rings, resample, split_ring
 from rlftsim.scenario.synthetic.street_plan import offset_polyline
 from rlftsim.scenario.types import MapFeatureType

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from rlftsim.scenario.synthetic.city_plan import draw_city_plan
-from rlftsim.scenario.synthetic.demand import draw_types
-from rlftsim.scenario.synthetic.freeway_plan import draw_freeway_plan
-from rlftsim.scenario.synthetic.street_plan import MAX_RADIUS_M, StreetPlan
+from rlftsim.scenario.synthetic.street_plan import MAX_RADIUS_M, StreetPlan, draw_city_plan, draw_freeway_plan
+from rlftsim.scenario.synthetic.sumo import draw_types
 
 
 def draw(kind: str, seed: int) -> StreetPlan:

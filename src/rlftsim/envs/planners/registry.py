@@ -4,16 +4,18 @@
 mine = "my_package:MyPlanner"
 """
 
+import ast
 import importlib
 import inspect
 import secrets
 import sys
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
 from typing import Any, Protocol, get_args, runtime_checkable
 
 from rlftsim.envs.actions import MIN_HORIZON, ActionType
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError, RlftsimError, in_short, locate_error
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.shards import hash_file
 
@@ -76,14 +78,16 @@ def load_planner(name: str) -> Planner:
     """Planner of a name.
 
     Args:
-        name: Registered name, or "package.module:Class" (or ":function") of code that can be imported.
+        name: Registered name, or "package.module:Class" (or ":function") of code that can be imported; options are
+            written behind either, "careful:Careful(headway=1.0)".
 
     Raises:
         ConfigError: Unknown, not importable, neither an object with `reset` and `act` nor a function, with other
-            arguments than these, or with an unknown type of action.
+            arguments than these, without such an option, or with an unknown type of action.
     """
-    if ":" in name:
-        module, _, attribute = name.partition(":")
+    location, options = _split_options(name)
+    if ":" in location:
+        module, _, attribute = location.partition(":")
         if not module or module.startswith("."):
             raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
         try:
@@ -93,25 +97,97 @@ def load_planner(name: str) -> Planner:
                 f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
             ) from error
     else:
-        loaded = PLANNERS.get(name)
+        loaded = PLANNERS.get(location)
     try:
-        planner = loaded() if isinstance(loaded, type) else loaded
-    except TypeError as error:
-        raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
+        if options and not isinstance(loaded, type):
+            inspect.signature(loaded).bind_partial(**options)
+            loaded = partial(loaded, **options)
+        planner = loaded(**options) if isinstance(loaded, type) else loaded
     except SystemExit as stop:
         raise ConfigError(
             f"planner {name!r} calls exit({stop.code!r}) when it is made: let it raise an error."
         ) from stop
+    except Exception as error:
+        way = f"with {', '.join(options)}" if options else "without arguments"
+        raise ConfigError(f"planner {name!r} cannot be made {way} ({type(error).__name__}: {error}).") from error
     if not isinstance(planner, Planner):
-        if not callable(planner):
-            class_name = type(planner).__name__
-            raise ConfigError(f"planner {name!r} is of type {class_name}: give it reset(info) and act(observation).")
-        _check_argument(f"planner {name!r}", planner, "observation")
-        planner = CallablePlanner(planner)
+        if callable(planner):
+            _check_argument(f"planner {name!r}", planner, "observation")
+        planner = to_planner(planner, f"planner {name!r}")
     _check_argument(f"reset of planner {name!r}", planner.reset, "info")
     _check_argument(f"act of planner {name!r}", planner.act, "observation")
     read_action_settings(planner)  # an unknown action ends here, not in the first episode
     return planner
+
+
+def _split_options(name: str) -> tuple[str, dict[str, Any]]:
+    """Name without options, and the options: numbers, texts and other literals by keyword.
+
+    Raises:
+        ConfigError: What stands in brackets are no such options.
+    """
+    location, bracket, _ = name.partition("(")
+    if not bracket:
+        return name, {}
+    try:
+        call: Any = ast.parse(f"planner{name[len(location) :]}", mode="eval").body
+        options = {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords if keyword.arg}
+        if call.args or len(options) < len(call.keywords):
+            raise ValueError(name)
+    except (SyntaxError, ValueError, AttributeError, RecursionError, MemoryError):
+        raise ConfigError(
+            f"planner {in_short(name)} cannot be read: write options by keyword, 'careful:Careful(headway=1.0)'."
+        ) from None
+    return location, options
+
+
+def to_planner(planner: Any, name: str = "planner") -> Planner:
+    """A planner, of a name, a function from observation to action, or itself.
+
+    Args:
+        planner: Name that `load_planner` takes, function, or object with `reset` and `act`.
+        name: Name of the planner at the beginning of the message.
+
+    Raises:
+        ConfigError: None of these.
+    """
+    if isinstance(planner, str):
+        return load_planner(planner)
+    if isinstance(planner, Planner) and not isinstance(planner, type):
+        return planner
+    if not callable(planner) or isinstance(planner, type):
+        raise ConfigError(f"{name} is of type {type(planner).__name__}: give it reset(info) and act(observation).")
+    return CallablePlanner(planner)
+
+
+class PlannerFailure(DataError):
+    """A planner cannot drive a scenario."""
+
+
+@contextmanager
+def guard_planner(planner: Planner, scenario_id: str, read_step: Callable[[], int]) -> Iterator[None]:
+    """Turn any error of a planner, and exit(), which would end the command as if all were done, into one line.
+
+    Args:
+        planner: Planner that is called within.
+        scenario_id: Scenario for the message.
+        read_step: Function that tells the step of the episode for the message.
+
+    Raises:
+        PlannerFailure: The planner raises an error, calls exit(), or wants what its type of action does not allow.
+    """
+    try:
+        yield
+    except MemoryError:  # no fault of the planner
+        raise
+    except (Exception, SystemExit) as error:
+        cause = f"exit({error.code!r})" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
+        # messages of ours say all that a user needs
+        cause = str(error) if isinstance(error, RlftsimError) else f"{cause} ({locate_error(error)})"
+        name = type(planner.function if isinstance(planner, CallablePlanner) else planner).__name__
+        raise PlannerFailure(
+            f"planner {name} fails at step {read_step()} of scenario {scenario_id}: {cause}"
+        ) from error
 
 
 def _check_argument(name: str, function: Callable[..., Any], argument: str) -> None:
@@ -136,9 +212,11 @@ def hash_code(name: str) -> str:
     """
     planner = load_planner(name)
     code: Any = planner.function if isinstance(planner, CallablePlanner) else planner
+    code = code.func if isinstance(code, partial) else code
     sources: list[Any] = [code if inspect.isroutine(code) else type(code)]
-    if ":" in name:
-        sources.append(sys.modules[name.partition(":")[0]])
+    location, _ = _split_options(name)
+    if ":" in location:
+        sources.append(sys.modules[location.partition(":")[0]])
     hashes = dict.fromkeys(filter(None, map(_hash_source, sources)))
     # without a file it may be other code than the last time
     return "-".join(hashes) or secrets.token_hex(32)

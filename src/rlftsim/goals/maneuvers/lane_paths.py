@@ -1,6 +1,9 @@
-"""Paths along the lanes from an agent's pose. Frame: world, m, float64.
+"""Paths along the lanes from an agent's pose, and the distance that it covers along one. Frame: world, m, float64.
 
-A path begins at the agent's center and eases into the middle of a lane. S points, one every meter.
+A path begins at the agent's center and eases into the middle of a lane. Some leave the own lane: into the neighboring
+lane, and back in the opposite direction. Reach is the distance by the end of a simulation, at plausible speeds.
+
+S points, one every meter.
 """
 
 from collections.abc import Iterator
@@ -12,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.geometry import wrapped
 from rlftsim.scenario.lane_graph import LaneGraph
-from rlftsim.scenario.types import MapFeatureType, ObjectType
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, MapFeatureType, ObjectType
 
 CRUISE_MPS = {
     MapFeatureType.LANE_UNDEFINED: 13.0,
@@ -37,6 +40,25 @@ EASE_M, EASE_S = 15.0, 2.0
 """An agent off the middle of the lane gets there over this distance or, if that is longer, in this time."""
 SMOOTHED_M = 2
 """Directions are taken over so many meters ahead and behind: logged points jitter."""
+CHANGE_STARTS_M = (0, 10, 20, 30)
+"""Where a lane change may begin; the first place with a neighboring lane is used."""
+CHANGE_S = 3.5
+CHANGE_M = (18.0, 100.0)
+"""A lane change is as long as the drive of so many seconds, within these bounds."""
+UTURN_RADIUS_M = (5.0, 15.0)
+"""Radii of the U-turns of cars, at the center of the box."""
+UTURN_STARTS_M = tuple(range(0, 15, 2))
+"""Distances into a junction at which a U-turn may begin."""
+LONGEST_UTURN_M = 7.0
+"""Longer vehicles make no U-turns."""
+OPPOSITE_RAD = np.radians(20.0)
+TURNING_RAD, BEFORE_TURN_M = np.radians(5.0), 3
+"""A turn begins so many meters before the path has turned by so much."""
+HORIZON_S = FUTURE_STEPS * STEP_S
+MIN_SPEED_MPS = 0.3
+"""Lower bound on the speed when distances become times, so that a standing agent's arrival stays finite."""
+MIN_CURVATURE = 1e-4
+"""Lower bound on the curvature, rad/m, so that straight paths have a finite speed limit."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +145,7 @@ def own_lanes(lanes: Lanes, pose: Pose) -> list[int]:
     distance = np.linalg.norm(graph.points[:, :2] - pose.position[:2], axis=1)
     candidates = np.flatnonzero((distance <= MAX_LANE_DISTANCE_M) & lanes.usable[graph.owner])
     candidates = candidates[np.abs(wrapped(graph.heading[candidates] - pose.heading)) <= SAME_DIRECTION_RAD]
-    nearest = nearest_of_each_lane(graph, candidates, distance)
+    nearest = nearest_per_lane(graph, candidates, distance)
     return [p for p in nearest if distance[p] <= distance[nearest[0]] + LANE_TOLERANCE_M]
 
 
@@ -140,7 +162,7 @@ def neighbor_lanes(lanes: Lanes, pose: Pose, *, side: int) -> list[int]:
     low, high = NEIGHBOR_M
     is_neighbor = (np.abs(x) <= SPACING_M) & (side * y >= low) & (side * y <= high) & lanes.usable[graph.owner]
     is_neighbor &= np.abs(wrapped(graph.heading - pose.heading)) <= PARALLEL_RAD
-    return nearest_of_each_lane(graph, np.flatnonzero(is_neighbor), np.hypot(x, y))
+    return nearest_per_lane(graph, np.flatnonzero(is_neighbor), np.hypot(x, y))
 
 
 def to_pose_frame(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
@@ -211,9 +233,7 @@ def shorten_path(path: LanePath, index: int) -> LanePath:
     return replace(path, points=path.points[steps], turn=path.turn[steps], speed_limit_mps=path.speed_limit_mps[steps])
 
 
-def nearest_of_each_lane(
-    graph: LaneGraph, points: Int64[np.ndarray, "m"], distance: Float[np.ndarray, "P"]
-) -> list[int]:
+def nearest_per_lane(graph: LaneGraph, points: Int64[np.ndarray, "m"], distance: Float[np.ndarray, "P"]) -> list[int]:
     """The nearest of the candidate points on each lane, ordered by distance.
 
     Args:
@@ -271,3 +291,154 @@ def _resample(
     distance = np.append(0.0, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).cumsum())
     grid = np.arange(0.0, distance[-1] + 1e-6, SPACING_M)
     return np.stack([np.interp(grid, distance, axis) for axis in points.T], -1), np.interp(grid, distance, values)
+
+
+def change_length_m(speed_mps: float) -> float:
+    """Distance that a lane change takes at a speed, m."""
+    return float(np.clip(CHANGE_S * speed_mps, *CHANGE_M))
+
+
+def lane_change_paths(
+    lanes: Lanes, own_path: LanePath, *, side: int, speed_mps: float, length_m: float
+) -> list[tuple[LanePath, int]]:
+    """Paths into the lane beside a path, each with the index at which the change is complete.
+
+    Args:
+        lanes: Lanes that the agent may use.
+        own_path: Path along the own lane, from the agent on.
+        side: Side of the neighboring lane: 1 left, -1 right.
+        speed_mps: Speed during the change, m/s; faster changes are longer.
+        length_m: Greatest length of a path, m.
+    """
+    change_m = change_length_m(speed_mps)
+    for start in CHANGE_STARTS_M:
+        if start + change_m > min(length_m, own_path.length_m + change_m):
+            break
+        pose = own_path.pose(start)
+        entries = neighbor_lanes(lanes, pose, side=side)
+        if entries:
+            paths = paths_from(lanes, pose, entries, length_m=length_m - start, ease_m=change_m)
+            return [(path.prepend(own_path, start), start + int(change_m / SPACING_M)) for path in paths]
+    return []
+
+
+def uturn_paths(lanes: Lanes, left_turn: LanePath, *, length_m: float) -> list[LanePath]:
+    """U-turns to the left, by a half circle where a path turns left, into lanes of the opposite direction.
+
+    Args:
+        lanes: Lanes that the agent may use.
+        left_turn: Path that turns left, from the agent on.
+        length_m: Greatest length of a path, m.
+    """
+    # 1. The entry: a little before the path begins to turn, in the leftmost lane.
+    bends = np.flatnonzero(np.abs(left_turn.turn - left_turn.turn[0]) >= TURNING_RAD)
+    first = max(int(bends[0]) - BEFORE_TURN_M, 0) if len(bends) else len(left_turn.turn) - 1
+    entry = left_turn.pose(first)
+    if neighbor_lanes(lanes, entry, side=1):
+        return []
+    forward = np.array([np.cos(entry.heading), np.sin(entry.heading), 0.0])
+    paths = []
+    for depth in UTURN_STARTS_M:
+        # 2. Straight on into the junction, then a half circle to each opposite lane within reach.
+        pose = Pose(entry.position + depth * forward, entry.heading)
+        straight = entry.position + SPACING_M * np.arange(depth)[:, None] * forward  # [depth, 3], last point left out
+        for point, radius in _find_opposite_lanes(lanes, pose):
+            half_circle = _half_circle(pose, radius)
+            head = np.concatenate([left_turn.points[:first], straight, half_circle])
+            limits = np.full(len(head), left_turn.speed_limit_mps[first])
+            # 3. On along the opposite lane.
+            end = Pose(half_circle[-1], pose.heading + np.pi)
+            for tail in paths_from(lanes, end, [point], length_m=length_m - len(head) * SPACING_M, ease_m=EASE_M):
+                points = np.concatenate([head, tail.points[1:]])
+                limits_mps = np.append(limits, tail.speed_limit_mps[1:])
+                paths.append(path_through(points, left_turn.start_heading, limits_mps))
+    return paths
+
+
+def _find_opposite_lanes(lanes: Lanes, pose: Pose) -> list[tuple[int, float]]:
+    """Points on opposite lanes to the left, with the radius of the half circle there, nearest first."""
+    graph = lanes.graph
+    x, y = to_pose_frame(pose, graph.points)
+    low, high = UTURN_RADIUS_M
+    is_opposite = (np.abs(x) <= SPACING_M) & (y >= 2 * low) & (y <= 2 * high) & lanes.usable[graph.owner]
+    is_opposite &= np.abs(wrapped(graph.heading - pose.heading - np.pi)) <= OPPOSITE_RAD
+    return [(point, float(y[point]) / 2) for point in nearest_per_lane(graph, np.flatnonzero(is_opposite), y)]
+
+
+def _half_circle(pose: Pose, radius: float) -> Float[np.ndarray, "n 3"]:
+    """Points of a half circle to the left of a pose, beginning there."""
+    angle = np.linspace(0.0, np.pi, int(np.ceil(np.pi * radius / SPACING_M)) + 1)
+    # In the frame of the pose, then rotated and moved into the world.
+    x, y = radius * np.sin(angle), radius * (1.0 - np.cos(angle))
+    cos, sin = np.cos(pose.heading), np.sin(pose.heading)
+    offset = np.stack([x * cos - y * sin, x * sin + y * cos, np.zeros_like(angle)], -1)
+    return pose.position + offset
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A driving style: largest accelerations and speeds."""
+
+    acceleration_mps2: float
+    braking_mps2: float
+    sideways_mps2: float
+    """In curves."""
+    over_limit: float
+    """Factor on speed limits."""
+
+
+USUAL = Drive(acceleration_mps2=1.2, braking_mps2=2.0, sideways_mps2=2.0, over_limit=1.0)
+BRISK = Drive(acceleration_mps2=2.5, braking_mps2=4.0, sideways_mps2=3.5, over_limit=1.2)
+"""The fastest style that is still plausible."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Distances along a path that are plausible after `HORIZON_S`, m."""
+
+    min_m: float
+    """Braking all the way."""
+    usual_m: float
+    max_m: float
+
+
+def compute_reach(path: LanePath, speed_mps: float) -> Reach:
+    """Smallest, usual and greatest plausible distance along a path after `HORIZON_S`.
+
+    Args:
+        path: Path that an agent can take; distances count from the first point.
+        speed_mps: Speed of the agent at the first point, m/s.
+    """
+    max_m = min(_compute_distance(path, speed_mps, BRISK), _find_tight_curve(path, speed_mps, BRISK))
+    usual_m = min(_compute_distance(path, speed_mps, USUAL), max_m)
+    return Reach(min(speed_mps**2 / (2 * BRISK.braking_mps2), max_m), usual_m, max_m)
+
+
+def _compute_distance(path: LanePath, speed_mps: float, drive: Drive) -> float:
+    """Distance after `HORIZON_S` at the highest allowed speeds; at most the length of the path."""
+    # 1. Speed that curves and limits allow at each point [S]; an agent above the limit now may keep its speed.
+    curve_speed = np.sqrt(drive.sideways_mps2 / np.maximum(np.abs(path.curvature), MIN_CURVATURE))
+    max_speed = np.minimum(curve_speed, np.maximum(path.speed_limit_mps * drive.over_limit, speed_mps))
+    # 2. Constant acceleration is linear in (squared speed, distance), v² = v0² + 2 a s: one backward pass keeps the
+    #    braking in time for what comes, one forward pass the acceleration from the start.
+    squared_speed = _running_bound(max_speed[::-1] ** 2, 2 * drive.braking_mps2)[::-1]
+    squared_speed[0] = min(squared_speed[0], speed_mps**2)
+    # 3. Time of arrival at each point, inverted at the horizon.
+    speed = np.sqrt(_running_bound(squared_speed, 2 * drive.acceleration_mps2))
+    pace = SPACING_M / np.maximum((speed[1:] + speed[:-1]) / 2, MIN_SPEED_MPS)
+    arrival_s = np.append(0.0, pace.cumsum())
+    return float(np.interp(HORIZON_S, arrival_s, SPACING_M * np.arange(len(speed))))
+
+
+def _running_bound(squared_speed: Float[np.ndarray, "S"], gain: float) -> Float[np.ndarray, "S"]:
+    """Squared speeds, lowered until none exceeds an earlier squared speed by more than `gain` per meter between."""
+    slope = gain * SPACING_M * np.arange(len(squared_speed))
+    return np.minimum.accumulate(squared_speed - slope) + slope
+
+
+def _find_tight_curve(path: LanePath, speed_mps: float, drive: Drive) -> float:
+    """Distance to the first point where the curve is too tight even after full braking; else infinite."""
+    squared_bound = drive.sideways_mps2 / np.maximum(np.abs(path.curvature), MIN_CURVATURE)
+    squared_speed = speed_mps**2 - 2 * drive.braking_mps2 * SPACING_M * np.arange(len(squared_bound))
+    steps = np.flatnonzero(squared_speed > squared_bound)
+    return float(SPACING_M * steps[0]) if len(steps) else float("inf")

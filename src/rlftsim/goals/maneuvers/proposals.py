@@ -7,6 +7,7 @@ degrees is a turn. A goal lies where a usual driver is when the simulation ends,
 under way. Lights, signs and other agents are ignored.
 
 Cyclists get straight, left and right and may use bicycle lanes. Pedestrians do not follow lanes and get no proposals.
+`logged_maneuver` names what an agent did in the log by the same rules.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -16,28 +17,40 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.goals.maneuvers.lane_paths import (
+    BRISK,
+    HORIZON_S,
+    LONGEST_UTURN_M,
     MAX_LANE_DISTANCE_M,
     LanePath,
     Lanes,
     Pose,
+    Reach,
+    change_length_m,
+    compute_reach,
     ease_m,
+    lane_change_paths,
     lanes_for,
     own_lanes,
     paths_from,
     shorten_path,
+    uturn_paths,
 )
-from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S, Reach, compute_reach
-from rlftsim.goals.maneuvers.road_lines import crosses_forbidden_line
-from rlftsim.goals.maneuvers.side_paths import LONGEST_UTURN_M, change_length_m, lane_change_paths, uturn_paths
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, STRAIGHT_RAD, Maneuver, classify_turn
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, MapFeatureType, ObjectType, Scenario, cached_on_scenario
 
+FORBIDDEN = (
+    MapFeatureType.LINE_SOLID_DOUBLE_WHITE,
+    MapFeatureType.LINE_SOLID_SINGLE_YELLOW,
+    MapFeatureType.LINE_SOLID_DOUBLE_YELLOW,
+)
+"""A single solid white line may be crossed where WOMD was logged; it only discourages."""
+GAP_M = 3.0
+"""Points of a line farther apart than this are not joined: clipped maps have holes."""
 RoadTest = Callable[[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"], Float[np.ndarray, "3"]], Float[np.ndarray, "S"]]
 """Distance by which a box sticks out beyond the road edge along a path, m, negative on the road.
 
 Arguments: path on the ground, headings (rad), size of the box (length, width, height)."""
-
 NEAREST_GOAL_M = 6.0
 """Goals nearer than this are not proposed: the agent hardly moves."""
 SPARE_M = 20.0
@@ -56,6 +69,50 @@ PARKED_OFFSET_M = 1.2
 LANE_AGENT_TYPES = (ObjectType.VEHICLE, ObjectType.CYCLIST)
 LANE_CHANGES = ((Maneuver.LANE_CHANGE_LEFT, 1), (Maneuver.LANE_CHANGE_RIGHT, -1))
 """Lane changes and sides, 1 = left."""
+IN_LANE_M = 1.5
+"""Greatest distance to the middle of a lane for an agent in the lane."""
+BEYOND_END_M = 10.0
+"""Paths along the lanes are searched so far beyond the logged distance."""
+
+
+def crosses_forbidden_line(scenario: Scenario, points: Float[np.ndarray, "S 3"]) -> bool:
+    """True if a path crosses a line that must not be crossed.
+
+    Args:
+        scenario: Scenario with the lines in the map.
+        points: Points of the path in order, world frame, m.
+    """
+    start, end = _segments(scenario)  # [n, 2] each
+    if not len(start) or len(points) < 2:
+        return False
+    # Only lines whose bounding box meets that of the path can cross it.
+    low, high = points[:, :2].min(0), points[:, :2].max(0)
+    may_cross = (np.maximum(start, end) >= low).all(1) & (np.minimum(start, end) <= high).all(1)
+    a, b = points[:-1, None, :2], points[1:, None, :2]  # [S - 1, 1, 2]
+    c, d = start[may_cross], end[may_cross]
+    # Two segments cross if each has its ends on both sides of the other.
+    parts_line = _side(a, b, c) * _side(a, b, d) < 0
+    parts_path = _side(c, d, a) * _side(c, d, b) < 0
+    return bool((parts_line & parts_path).any())
+
+
+@cached_on_scenario
+def _segments(scenario: Scenario) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Both ends of every segment of a forbidden line."""
+    features = scenario.map_features
+    lines = [features.polyline(i)[:, :2].astype(np.float64) for i in features.find_indices(FORBIDDEN)]
+    start = np.concatenate([np.zeros((0, 2)), *(line[:-1] for line in lines)])
+    end = np.concatenate([np.zeros((0, 2)), *(line[1:] for line in lines)])
+    is_joined = np.linalg.norm(end - start, axis=1) <= GAP_M
+    return start[is_joined], end[is_joined]
+
+
+def _side(
+    start: Float[np.ndarray, "... 2"], end: Float[np.ndarray, "... 2"], point: Float[np.ndarray, "... 2"]
+) -> Float[np.ndarray, "..."]:
+    """Cross product of a segment and the offset to a point: positive to the left, negative to the right."""
+    direction, offset = end - start, point - start
+    return direction[..., 0] * offset[..., 1] - direction[..., 1] * offset[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,3 +319,50 @@ def _find_goal(path: LanePath, reach: Reach) -> int | None:
     if len(later_steps):
         return int(later_steps[0])
     return int(earlier_steps[-1]) if len(earlier_steps) else usual_end
+
+
+def logged_maneuver(scenario: Scenario, track: int) -> Proposal | None:
+    """Logged maneuver and endpoint of a vehicle or cyclist; None for hardly any motion or no logged future.
+
+    Turns are named by the change of heading. An agent that went straight has changed lanes if the endpoint is in a
+    neighboring lane and in no lane that the own lane continues into.
+
+    Args:
+        scenario: Scenario with its logged future.
+        track: Index of a simulated track in the scenario.
+    """
+    # 1. The logged path from the current step on, and the change of heading along it.
+    tracks = scenario.tracks
+    if int(tracks.object_type[track]) not in LANE_AGENT_TYPES:
+        return None
+    steps = CURRENT_STEP + np.flatnonzero(tracks.valid[track, CURRENT_STEP:])
+    path = tracks.position[track, steps].astype(np.float64)  # [S, 3]
+    if np.linalg.norm(path[-1, :2] - path[0, :2]) < NEAREST_GOAL_M:
+        return None
+    heading = np.unwrap(tracks.heading[track, steps].astype(np.float64))
+    # 2. Its name.
+    maneuver = classify_turn(float(heading[-1] - heading[0]))
+    if maneuver == Maneuver.STRAIGHT:
+        maneuver = _find_lane_change(scenario, track, path) or maneuver
+    if maneuver is None:
+        return None
+    return Proposal(int(tracks.object_id[track]), maneuver, path[-1, :2], path, is_logged=True)
+
+
+def _find_lane_change(scenario: Scenario, track: int, path: Float[np.ndarray, "S 3"]) -> Maneuver | None:
+    """Lane change at the end of a straight path, if any."""
+    agent = CurrentAgent.from_track(scenario, track)
+    if agent.object_type != ObjectType.VEHICLE:
+        return None
+    lanes = lanes_for(lane_graph(scenario), agent.object_type)
+    length_m = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()) + BEYOND_END_M
+    paths = own_paths(agent, lanes, length_m=length_m)
+    if not paths or distance_to(paths, path[-1]) < LANE_CHANGE_OFFSET_M:
+        return None
+    for maneuver, side in LANE_CHANGES:
+        # At speed 0 the change is as short as it can be: the path is soon in the middle of the other lane.
+        changes = [lane_change_paths(lanes, start, side=side, speed_mps=0.0, length_m=length_m) for start in paths]
+        neighbor_paths = [neighbor_path for candidates in changes for neighbor_path, _ in candidates]
+        if neighbor_paths and distance_to(neighbor_paths, path[-1]) < IN_LANE_M:
+            return maneuver
+    return None

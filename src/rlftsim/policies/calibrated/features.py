@@ -10,18 +10,25 @@ may not read the logged future. A separate package announces features as entry p
 
     [project.entry-points."rlftsim.features"]
     braking = "my_package.features:braking"
+
+R elements, P pairs of an element and a candidate token, K features, V tokens.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
-from rlftsim.policies.calibrated.candidates import SUPPORT_NATS, Candidates
+from rlftsim.policies.calibrated.candidates import SUPPORT_NATS, Candidates, Scene, Traffic
+from rlftsim.policies.distributions import CategoricalDistribution
+from rlftsim.rollout.rows import find_rows
+from rlftsim.tokens.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True)
@@ -49,9 +56,7 @@ class Feature:
         return values.clamp(self.low, self.high)
 
 
-FEATURES: ExtensionPoint[Feature] = ExtensionPoint(
-    "feature", "rlftsim.features", use=lambda name: features_by_name([name])
-)
+FEATURES = ExtensionPoint[Feature]("feature", "rlftsim.features", use=lambda name: features_by_name([name]))
 """Features by name, this package's and others'."""
 
 
@@ -99,28 +104,16 @@ def features_by_name(names: Sequence[str]) -> tuple[Feature, ...]:
 # ---- speed and direction of vehicles that move ----------------------------------------------------------------------
 
 
-@register_feature("speed_gap_under_2s", low=-1.5, high=1.5)
-def speed_gap_under_2s(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of speed, m/s, where the leader is less than 2 s ahead."""
-    return c.speed_change * c.where(c.is_moving & (c.time_gap < 2))
-
-
-@register_feature("speed_gap_2_to_4s", low=-1.5, high=1.5)
-def speed_gap_2_to_4s(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of speed, m/s, where the leader is 2 to 4 s ahead."""
-    return c.speed_change * c.where(c.is_moving & (c.time_gap >= 2) & (c.time_gap < 4))
-
-
-@register_feature("turn_to_lane_direction", low=-2.0, high=2.0)
-def turn_to_lane_direction(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of turn times the angle of the lane to the heading; positive = towards the lane's direction."""
-    return 10 * c.turn_change * c.of_pairs(c.lane_turn * c.is_moving)
-
-
-@register_feature("turn_to_lane_center", low=-2.0, high=2.0)
-def turn_to_lane_center(c: Candidates) -> Float[Tensor, "P"]:
-    """Change of turn times the lateral offset of the lane's center; positive = towards the center."""
-    return 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)
+for _name, _limit, _compute in (
+    # change of speed, m/s, where the leader is less than 2 s ahead, or 2 to 4 s
+    ("speed_gap_under_2s", 1.5, lambda c: c.speed_change * c.where(c.is_moving & (c.time_gap < 2))),
+    ("speed_gap_2_to_4s", 1.5, lambda c: c.speed_change * c.where(c.is_moving & (c.time_gap >= 2) & (c.time_gap < 4))),
+    # change of turn times the angle of the lane to the heading; positive = towards the lane's direction
+    ("turn_to_lane_direction", 2.0, lambda c: 10 * c.turn_change * c.of_pairs(c.lane_turn * c.is_moving)),
+    # change of turn times the lateral offset of the lane's center; positive = towards the center
+    ("turn_to_lane_center", 2.0, lambda c: 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)),
+):
+    register_feature(_name, low=-_limit, high=_limit)(_compute)
 
 
 # ---- by speed: slow below 4 m/s, middle, fast from 9 m/s -------------------------------------------------------------
@@ -151,9 +144,83 @@ for _seconds in (0.5, 1.0):
     register_feature(f"edge_{_seconds:g}s", low=0.0, high=3.0)(
         lambda c, seconds=_seconds: c.road_edge(seconds) * c.where(c.is_vehicle)
     )
+register_feature("edge_0.5s_walking_cycling", low=0.0, high=3.0)(lambda c: c.road_edge(0.5) * c.where(~c.is_vehicle))
 
 
-@register_feature("edge_0.5s_walking_cycling", low=0.0, high=3.0)
-def edge_walking_cycling(c: Candidates) -> Float[Tensor, "P"]:
-    """Nearness of the road edge in half a second, of pedestrians and cyclists."""
-    return c.road_edge(0.5) * c.where(~c.is_vehicle)
+@dataclass(frozen=True, eq=False)
+class TiltedDistribution(CategoricalDistribution):
+    """p(token) proportional to base(token) exp(eta · f(state, token)); the base, bit for bit, where eta is 0.
+
+    Features are 0 for tokens that are no candidates, see `Candidates`.
+    """
+
+    base: CategoricalDistribution
+    eta: Float[Tensor, "K"]
+    features: Sequence[Feature]
+    scene: Scene
+    traffic: Traffic
+    vocabulary: Vocabulary
+    seconds: float
+    """Duration of a decision."""
+
+    @property
+    def mask(self) -> Bool[Tensor, "*batch"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """True = the element decides."""
+        return self.base.mask
+
+    @cached_property
+    def logits(self) -> Float[Tensor, "R V"]:
+        """Logits in float32: those of the base, shifted for candidates."""
+        logits = self.base.logits
+        if not self.eta.any():
+            return logits
+        return logits.flatten().index_add(0, self._pairs[2], self.values @ self.eta).view_as(logits)
+
+    @cached_property
+    def values(self) -> Float[Tensor, "P K"]:
+        """Features of all candidates."""
+        candidates = self._candidates
+        return torch.stack([feature(candidates) for feature in self.features], -1) * candidates.weight[:, None]
+
+    def score_function(self, decision: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
+        """Gradient of the decisions' log-probability by eta: the features of the chosen token minus the mean of all.
+
+        Args:
+            decision: Id of the token that each element chose, drawn from the full distribution.
+        """
+        row, token, logit_index = self._pairs
+        is_chosen = token == self._rows(decision).index_select(0, row)
+        weight = is_chosen.float() - self.log_probs.detach().flatten().index_select(0, logit_index).exp()
+        centered = self.values.new_zeros(self._num_rows, len(self.features))
+        return self._dense(centered.index_add(0, row, weight[:, None] * self.values.detach()))
+
+    @property
+    def _num_rows(self) -> int:
+        return self.base._num_rows
+
+    @cached_property
+    def _peak(self) -> Float[Tensor, "R 1"]:
+        return self.base.logits.amax(-1, keepdim=True)
+
+    @cached_property
+    def _pairs(self) -> tuple[Int64[Tensor, "P"], Int64[Tensor, "P"], Int64[Tensor, "P"]]:
+        """Row and token of each candidate, and the index into the flattened logits; rows with a single candidate have
+        none."""
+        num_tokens = self.base.logits.shape[1]
+        logit_index = (self.base.logits > self._peak - SUPPORT_NATS).flatten().nonzero()[:, 0]
+        row = logit_index.div(num_tokens, rounding_mode="floor")
+        has_choice = (torch.bincount(row, minlength=self._num_rows) > 1).index_select(0, row)
+        row, logit_index = row[has_choice], logit_index[has_choice]
+        return row, logit_index - row * num_tokens, logit_index
+
+    @cached_property
+    def _candidates(self) -> Candidates:
+        row, token, logit_index = self._pairs
+        has_choice, index = row.unique_consecutive(return_inverse=True)
+        agent = tuple(axis[has_choice] for axis in find_rows(self.mask, is_dense=self._num_rows == self.mask.numel()))
+        agent = (*agent, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
+        class_id = self.scene.class_id[agent[0], agent[2]].index_select(0, index)
+        ends = self.vocabulary.poses[:, :, -1]  # [C, V, 3]
+        end = ends.flatten(0, 1).index_select(0, class_id * ends.shape[1] + token)
+        log_ratio = self.base.logits.flatten().index_select(0, logit_index) - self._peak[:, 0].index_select(0, row)
+        return Candidates(self.scene, self.traffic, agent, index, end, log_ratio, self.seconds)

@@ -1,5 +1,7 @@
 """A policy with a vocabulary, calibrated: eta · f(state, token) on the logits, with named features f.
 
+A model folder has a `calibration.json`: weight and gain of each feature, and the changes on the scenarios held back.
+
 B scenarios, N rollouts, A agents, L decisions, K features.
 """
 
@@ -15,11 +17,10 @@ from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import write_text
-from rlftsim.policies.calibrated.distribution import TiltedDistribution
-from rlftsim.policies.calibrated.features import features_by_name
-from rlftsim.policies.calibrated.table import calibration_table, read_calibration
-from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
+from rlftsim.policies.calibrated.candidates import Scene, Traffic, build_scene, join_moments
+from rlftsim.policies.calibrated.features import TiltedDistribution, features_by_name
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
 from rlftsim.policies.registry import load_policy
@@ -28,6 +29,16 @@ from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import STEP_S
 
+CHANGES = {
+    "rmm": ("RMM", "+.4f"),
+    "kinematic": ("kinematic", "+.4f"),
+    "interactive": ("interactive", "+.4f"),
+    "map_based": ("map-based", "+.4f"),
+    "min_ade": ("minADE (m)", "+.3f"),
+    "speed": ("speed (m/s)", "+.3f"),
+    "evaluated_speed": ("of evaluated agents (m/s)", "+.3f"),
+}
+"""Heading and format of each change that is shown."""
 BASE = "base"
 """Model folder of the policy that is calibrated, inside the folder of the calibrated one."""
 CALIBRATION = "calibration.json"
@@ -39,8 +50,63 @@ PASSED_ON = (
 """Attributes that a calibrated policy passes on from the base, if the base has these."""
 
 
+def read_calibration(path: Path) -> dict[str, Any]:
+    """Values of a calibration.json.
+
+    Raises:
+        FileNotFoundError: No such file.
+        CheckpointError: Damaged file, or values that are no calibration.
+    """
+    calibration = read_json(path, "remove it", error=CheckpointError)
+    try:
+        calibration_table(calibration)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise CheckpointError(f"{path}: no calibration of this version: remove it.") from None
+    return calibration
+
+
+def calibration_table(calibration: Mapping[str, Any]) -> str:
+    """Markdown of a calibration.
+
+    Args:
+        calibration: Values of calibration.json, as `training.calibrate` writes these.
+    """
+    num_fitted, num_held_back = calibration["num_scenarios"]
+    scores = ("rmm", "kinematic", "interactive", "map_based")
+    features = [
+        [row["feature"], f"{row['eta']:+.3f}", f"{row['t']:+.1f}", *(f"{row[name]:+.4f}" for name in scores)]
+        for row in sorted(calibration["features"], key=lambda row: -row["rmm"])
+    ]
+    lengths = [
+        [f"{row['length']:g}", f"{row['kl']:.4f}", *(_with_t(row[name], style) for name, (_, style) in CHANGES.items())]
+        for row in calibration["held_back"]
+    ]
+    return f"""## Calibration
+
+What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {num_fitted} scenarios with
+{calibration["num_rollouts"]} rollouts each; t is that of its gradient over scenarios.
+Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "nothing"}.
+
+{_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), features)}
+
+Measured on {num_held_back} scenarios that were held back, with t in parentheses. The length taken is
+{calibration["length"]:.2f}.
+
+{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), lengths)}
+"""
+
+
+def _with_t(change: Mapping[str, float], style: str) -> str:
+    return f"{change['change']:{style}} ({change['t']:+.1f})"
+
+
+def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    rule = ["---", *["--:"] * (len(headings) - 1)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, rule, *rows))
+
+
 @dataclass(frozen=True, eq=False)
-class CalibratedContext:
+class Context:
     """Context of the base, and the scene that features look at."""
 
     base: Any
@@ -48,7 +114,7 @@ class CalibratedContext:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedState:
+class State:
     """State of the base, and the agents' motion."""
 
     base: Any
@@ -94,11 +160,10 @@ class CalibratedPolicy(nn.Module):
         self.base: Any = base
         self.features = tuple(features)
         self._features = features_by_name(self.features)
-        values = torch.zeros(len(self.features)) if eta is None else torch.tensor(eta, dtype=torch.float32)
-        if values.shape != (len(self.features),):
-            raise ConfigError(
-                f"eta has {len(values)} weights for {len(self.features)} features: it needs one for each."
-            )
+        count = len(self.features)
+        values = torch.zeros(count) if eta is None else torch.tensor(eta, dtype=torch.float32)
+        if values.shape != (count,):
+            raise ConfigError(f"eta has {len(values)} weights for {count} features: it needs one for each.")
         # A parameter, so that runs can be averaged; never trained by a gradient of the complete model.
         self.eta = nn.Parameter(values, requires_grad=False)
         self._calibration = dict(calibration or {})
@@ -133,13 +198,11 @@ class CalibratedPolicy(nn.Module):
 
     # ---- the policy interface -------------------------------------------------------------------------------------
 
-    def encode(self, scenarios: ScenarioBatch) -> CalibratedContext:
+    def encode(self, scenarios: ScenarioBatch) -> Context:
         """Context of the base, lanes and edges of the maps, and the current step."""
-        return CalibratedContext(self.base.encode(scenarios), build_scene(scenarios))
+        return Context(self.base.encode(scenarios), build_scene(scenarios))
 
-    def begin(
-        self, context: CalibratedContext, num_rollouts: int, goals: Goals | None, noise: Tensor
-    ) -> CalibratedState:
+    def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current step, N times.
 
         Args:
@@ -149,20 +212,18 @@ class CalibratedPolicy(nn.Module):
             noise: Uniform numbers for the base, `initial_noise_size` per agent.
         """
         base = self.base.begin(context.base, num_rollouts, goals, noise)
-        return CalibratedState(base, context.scene.begin(num_rollouts))
+        return State(base, context.scene.begin(num_rollouts))
 
-    def decide(self, context: CalibratedContext, state: CalibratedState) -> TiltedDistribution:
+    def decide(self, context: Context, state: State) -> TiltedDistribution:
         """Tilted distributions [B, N, A] of the next token.
 
         Args:
             context: Result of `encode` for the scenarios.
             state: State before the decision.
         """
-        return self._tilt(context, self.base.decide(context.base, state.base), state.traffic)
+        return self._tilt(context.scene, self.base.decide(context.base, state.base), state.traffic)
 
-    def advance(
-        self, context: CalibratedContext, state: CalibratedState, decision: Tensor, forced: AgentStates | None = None
-    ) -> CalibratedState:
+    def advance(self, context: Context, state: State, decision: Tensor, forced: AgentStates | None = None) -> State:
         """State after a decision.
 
         Args:
@@ -172,9 +233,9 @@ class CalibratedPolicy(nn.Module):
             forced: States [B, N, A, t] imposed from outside, as for the base.
         """
         base = self.base.advance(context.base, state.base, decision, forced)
-        return CalibratedState(base, state.traffic.advance(base.poses, self._seconds))
+        return State(base, state.traffic.advance(base.poses, self._seconds))
 
-    def score(self, context: CalibratedContext, rollouts: Rollouts) -> CategoricalDistribution:
+    def score(self, context: Context, rollouts: Rollouts) -> CategoricalDistribution:
         """Tilted distributions [B, N, A, L] along rollouts.
 
         Args:
@@ -188,7 +249,7 @@ class CalibratedPolicy(nn.Module):
         path = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)  # [B, N, A, T, 3]
         for poses in path.split(self.steps_per_decision, 3)[:-1]:
             moments.append(moments[-1].advance(poses, self._seconds))
-        return self._tilt(context, scored, join_moments(moments))
+        return self._tilt(context.scene, scored, join_moments(moments))
 
     # ---- variants of the base -------------------------------------------------------------------------------------
 
@@ -262,7 +323,5 @@ class CalibratedPolicy(nn.Module):
         """Duration of a decision."""
         return self.steps_per_decision * STEP_S
 
-    def _tilt(self, context: CalibratedContext, dist: Any, traffic: Traffic) -> TiltedDistribution:
-        return TiltedDistribution(
-            dist, self.eta, self._features, context.scene, traffic, self.vocabulary, self._seconds
-        )
+    def _tilt(self, scene: Scene, dist: Any, traffic: Traffic) -> TiltedDistribution:
+        return TiltedDistribution(dist, self.eta, self._features, scene, traffic, self.vocabulary, self._seconds)

@@ -57,7 +57,7 @@ class SmartConfig:
     vocabulary; an index then means a different motion in each class."""
     continuation_scores: bool = False
     """The head also scores tokens by how they change the agent's speed and where they turn, see
-    `heads.ContinuationScores`: so a model learns from far fewer scenarios, and keeps its speed. False = the public
+    `embeddings.ContinuationScores`: so a model learns from far fewer scenarios, and keeps its speed. False = the public
     code's head."""
     goal: GoalEncoding | None = None
     """Encoding of goals; None = goal-free, goals have no effect."""

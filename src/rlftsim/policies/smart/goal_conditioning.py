@@ -76,9 +76,6 @@ def select_rows(mask: Bool[Tensor, "R"]) -> Int64[Tensor, "g"]:
 class GoalEmbedding(FourierEmbedding):
     """`concat`: embedding of distance and bearing that joins an agent's continuous state."""
 
-    def __init__(self, dim: int, num_frequencies: int):
-        super().__init__(2, dim, num_frequencies)
-
     def zero_init(self) -> None:
         """Zero the last map: the embedding of any goal is zero."""
         for weight in self.out[-1].parameters():
@@ -117,9 +114,6 @@ class GoalEmbedding(FourierEmbedding):
 class GoalEdgeEmbedding(nn.Embedding):
     """`indication`: the embedding that is added to the relation to an agent's goal polyline."""
 
-    def __init__(self, dim: int):
-        super().__init__(1, dim)
-
     def zero_init(self) -> None:
         """Zero the embedding: the relation to the goal polyline is as to any other map token."""
         nn.init.zeros_(self.weight)
@@ -138,9 +132,10 @@ class GoalEdgeEmbedding(nn.Embedding):
         return normalize(embedding(values, zeros)), normalize(embedding(values, goal))
 
 
-def build_goal_encoder(
-    encoding: GoalEncoding | None, dim: int, num_frequencies: int
-) -> GoalEmbedding | GoalEdgeEmbedding | None:
+GoalEncoder = GoalEmbedding | GoalEdgeEmbedding
+
+
+def build_goal_encoder(encoding: GoalEncoding | None, dim: int, num_frequencies: int) -> GoalEncoder | None:
     """Module of a goal encoding, with random weights; None for a goal-free model.
 
     Args:
@@ -150,7 +145,7 @@ def build_goal_encoder(
     """
     if encoding is None:
         return None
-    return GoalEmbedding(dim, num_frequencies) if encoding == "concat" else GoalEdgeEmbedding(dim)
+    return GoalEmbedding(2, dim, num_frequencies) if encoding == "concat" else GoalEdgeEmbedding(1, dim)
 
 
 class GoalLogitBias(nn.Module):
@@ -222,10 +217,7 @@ class GoalLogitBias(nn.Module):
 
 @torch.no_grad()
 def suitability(
-    goal: Float[Tensor, "g 2"],
-    num_left: Int64[Tensor, "g"],
-    class_id: Int64[Tensor, "g"],
-    moves: Float[Tensor, "C V 2"],
+    goal: Float[Tensor, "g 2"], num_left: Int64[Tensor, "g"], class_id: Int64[Tensor, "g"], ends: Float[Tensor, "C V 2"]
 ) -> Float[Tensor, "g 3 V"]:
     """Features of `GoalLogitBias`: progress, minus pace, minus direction; larger for a token that suits better.
 
@@ -233,12 +225,12 @@ def suitability(
         goal: Goal of each row, meters, in the agent's frame.
         num_left: Number of decisions left, the next included, from 1 to 16.
         class_id: Agent class that each row's token ids refer to.
-        moves: Displacement by each token, meters, in the agent's frame.
+        ends: Displacement by each token, meters, in the agent's frame.
     """
-    features = goal.new_empty(len(goal), 3, moves.shape[1])
+    features = goal.new_empty(len(goal), 3, ends.shape[1])
     left_s = (num_left[:, None] - 1).to(goal.dtype) * TOKEN_S  # [g, 1]
     # in blocks, and in place where possible: at 2048 tokens these [r, V] tensors dominate a rollout's time
-    for rows, move in _row_blocks(class_id, moves):
+    for rows, move in _row_blocks(class_id, ends):
         x, y = move.unbind(-1)  # [V] or [r, V]
         speed = move.norm(dim=-1) / TOKEN_S
         (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]  # [r, 1]

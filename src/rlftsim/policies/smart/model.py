@@ -6,6 +6,7 @@ A agents, B scenarios, N rollouts, D width, R selected elements, V tokens.
 import copy
 import math
 import os
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import TypeVar
@@ -16,25 +17,26 @@ from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.folder import check_folder
-from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
-from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
-from rlftsim.policies.sharing import are_frozen_alike
+from rlftsim.policies.checkpoint import are_frozen_alike, load_network, load_strictly, read_model, save_model
+from rlftsim.policies.distributions import (
+    NEVER,
+    CategoricalDistribution,
+    LazyTokenDistribution,
+    TokenDistribution,
+    TokenRows,
+)
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
-from rlftsim.policies.smart.embeddings import normalize
+from rlftsim.policies.smart.embeddings import ClassHeads
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
-from rlftsim.policies.smart.heads import ClassHeads
-from rlftsim.policies.smart.neighbors import bound_neighbors
-from rlftsim.policies.smart.network import Scene, SmartNetwork, mask_positions
+from rlftsim.policies.smart.network import Scene, SmartNetwork
 from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
-from rlftsim.policies.token_rows import NEVER, TokenRows
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
-from rlftsim.tokens.map_tokens import tokenize_map
-from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
+from rlftsim.tokens.alignment import align_vocabulary
+from rlftsim.tokens.vocabulary import Vocabulary
 
 VOCABULARY = "vocabulary.safetensors"
-
 
 Model = TypeVar("Model", bound="SmartModel")
 
@@ -86,6 +88,28 @@ class SmartModel(nn.Module):
         if (self.config, self.vocabulary) != (model.config, model.vocabulary):
             return False
         return are_frozen_alike(self.network.scene_weights(), model.network.scene_weights())
+
+    def with_settings(self: Model, config: SmartConfig, vocabulary: Vocabulary | None, keep: Collection[str]) -> Model:
+        """Model with other settings and the weights of this one, to be trained further.
+
+        Args:
+            config: Settings of the new model, with the same sizes.
+            vocabulary: Tokens in place of the model's, see `align_vocabulary`; None = no change.
+            keep: Classes that stay with the model's tokens.
+
+        Raises:
+            CheckpointError: The weights are of other sizes.
+            ConfigError: More tokens than the model can hold, or a separate head for each class.
+        """
+        if vocabulary is not None and self.config.head_per_class:
+            raise ConfigError(
+                "each class of this model has a head of its own, whose places other tokens cannot take: leave "
+                "--vocabulary out."
+            )
+        tokens = self.vocabulary if vocabulary is None else align_vocabulary(vocabulary, self.vocabulary, keep=keep)
+        model = type(self)(config, tokens)
+        load_strictly(model, self.state_dict(), source="the model to train further")
+        return model
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 
@@ -167,34 +191,12 @@ class SmartModel(nn.Module):
         if not path.exists():
             raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
         vocabulary = Vocabulary.load(path)
-        check_fit(lambda: cls(config, vocabulary).network, weights, source=str(model.folder))
-        policy = cls(config, vocabulary)
-        load_strictly(policy.network, weights, source=str(model.folder))
-        return policy
+        return load_network(lambda: cls(config, vocabulary), weights, source=model.folder)
 
     # ---- parts of a forward pass ----------------------------------------------------------------------------------
 
     def _build_scene(self, scenarios: ScenarioBatch) -> Scene:
-        tokens = tokenize_map(scenarios, self.vocabulary.map_prototypes)
-        class_id = class_of_type(scenarios.object_type)
-        decoder = self.network.decoder
-        max_map_tokens = None
-        if self.config.max_agent_map_neighbors is None and tokens.position.device.type != "cpu":
-            # the host waits for the bound once, and not at every decision
-            candidates = mask_positions(tokens.token_mask, tokens.position)
-            max_map_tokens = bound_neighbors(candidates, self.config.agent_map_radius_m)
-        return Scene(
-            map_position=tokens.position,
-            map_heading=tokens.heading,
-            map_mask=tokens.token_mask,
-            map_features=normalize(self.network.map_encoder(tokens, self.vocabulary.map_prototypes)),
-            class_id=class_id,
-            agent_features=decoder.embed_agents(class_id, scenarios.size),
-            token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
-            token_keys=None if decoder.scores is None else decoder.scores.keys(self.vocabulary.poses[:, :, -1]),
-            relations=decoder.relations(),
-            max_map_tokens=max_map_tokens,
-        )
+        return self.network.build_scene(scenarios, self.vocabulary)
 
     def _tokenize(self, scenarios: ScenarioBatch) -> AgentTokens:
         return tokenize_agents(scenarios, self.vocabulary, catk_compat=self.config.catk_compat)
@@ -203,25 +205,21 @@ class SmartModel(nn.Module):
         return build_logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
 
     def _predict(
-        self,
-        scene: Scene,
-        features: Float[Tensor, "R E"],
-        token_class: Int64[Tensor, "B A"],
-        mask: Bool[Tensor, "B N A *L"],
+        self, scene: Scene, x: Float[Tensor, "R E"], token_class: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
-        scenario, _, agent, *_ = find_rows(mask, is_dense=len(features) == mask.numel())
+        scenario, _, agent, *_ = find_rows(mask, is_dense=len(x) == mask.numel())
         class_id = token_class[scenario, agent]  # [R]
         head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):
-            return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
+            return TokenDistribution(head(x, class_id).masked_fill(~exists[class_id], NEVER), mask)
         *first, last = head
         assert isinstance(last, nn.Linear)
-        hidden, weight = nn.Sequential(*first)(features[:, : self.config.dim]), last.weight
+        hidden, weight = nn.Sequential(*first)(x[:, : self.config.dim]), last.weight
         if scores is not None:
             assert scene.token_keys is not None
             # both terms of the logits in one product
-            last_phase = features[:, self.config.dim :]
+            last_phase = x[:, self.config.dim :]
             hidden = torch.cat([hidden, scores.queries(hidden, last_phase, class_id)], -1)
             weight = torch.cat([weight, scene.token_keys.keys], -1)
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)

@@ -28,11 +28,14 @@ from rlftsim.policies.smart.attention import (
 )
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.embeddings import (
+    ClassHeads,
+    ContinuationScores,
     FourierEmbedding,
     Grid,
     MlpEmbedding,
     MlpLayer,
     RelationEmbedding,
+    TokenKeys,
     initialize,
     normalize,
     tabulate,
@@ -45,12 +48,12 @@ from rlftsim.policies.smart.goal_conditioning import (
     build_goal_encoder,
     select_rows,
 )
-from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
-from rlftsim.policies.smart.neighbors import Poses, find_neighbors, group_rows, relative_pose
+from rlftsim.policies.smart.neighbors import Poses, bound_neighbors, find_neighbors, group_rows, relative_pose
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import find_rows, place_rows
-from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens
-from rlftsim.tokens.vocabulary import CLASS_NAMES
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens, tokenize_map
+from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary, class_of_type
 
 MAX_LOOK_BACK_M = 160.0
 """Largest distance between an agent and the remembered positions (3 s at 50 m/s), for tables."""
@@ -70,7 +73,9 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
-    relations: "Relations"
+    time_relation: RelationEmbedding
+    map_relation: RelationEmbedding
+    agent_relation: RelationEmbedding
     max_map_tokens: int | None = None
     """No agent has more map tokens within reach, in any position. None on the CPU, which counts at every step."""
     token_keys: TokenKeys | None = None
@@ -83,24 +88,15 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Relations:
-    """Embeddings of the decoder's relations."""
-
-    time: RelationEmbedding
-    map: RelationEmbedding
-    agent: RelationEmbedding
-
-
-@dataclass(frozen=True, eq=False)
 class Past:
     """Steps of earlier blocks, as sources of the attention over time."""
 
+    sources: tuple[Float[Tensor, "S D"], ...]
+    """Normalized inputs of each layer's attention over time."""
     position: Float[Tensor, "B N A P 2"]
     heading: Float[Tensor, "B N A P"]
     row: Int64[Tensor, "B N A P"]
     """Row of `sources`, -1 where there is none."""
-    sources: tuple[Float[Tensor, "S D"], ...]
-    """Normalized inputs of each layer's attention over time."""
 
     def append(self, steps: TokenSteps, row: Int64[Tensor, "B N A K"]) -> "Past":
         """The past with a block's poses appended, and the sources unchanged.
@@ -109,23 +105,17 @@ class Past:
             steps: Block of steps that follows the past.
             row: Row of `sources` that the block's features will have, -1 where there is none.
         """
-        return Past(
-            torch.cat([self.position, steps.position], 3),
-            torch.cat([self.heading, steps.heading], 3),
-            torch.cat([self.row, row], 3),
-            self.sources,
-        )
+        pairs = ((self.position, steps.position), (self.heading, steps.heading), (self.row, row))
+        return Past(self.sources, *(torch.cat(pair, 3) for pair in pairs))
 
     def repeat(self, num_rollouts: int) -> "Past":
         """The past of a single rollout, shared by N rollouts."""
-        position, heading, row = (
-            value.expand(-1, num_rollouts, *value.shape[2:]) for value in (self.position, self.heading, self.row)
-        )
-        return Past(position, heading, row, self.sources)
+        tensors = (self.position, self.heading, self.row)
+        return Past(self.sources, *(values.expand(-1, num_rollouts, *values.shape[2:]) for values in tensors))
 
     def without_last_step(self) -> "Past":
         """The past before the last step. Rows of the sources that are no longer referred to stay."""
-        return Past(self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1], self.sources)
+        return Past(self.sources, self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1])
 
     def last(self, num_steps: int) -> "Past":
         """The last steps, with padding where there are fewer, and as many sources for every agent.
@@ -136,10 +126,10 @@ class Past:
         row = functional.pad(self.row, (num_added, 0), value=-1)
         selected = row.flatten().clamp(min=0)
         return Past(
+            tuple(source.index_select(0, selected) for source in self.sources),
             functional.pad(self.position, (0, 0, num_added, 0)),
             functional.pad(self.heading, (num_added, 0)),
             torch.where(row >= 0, torch.arange(len(selected), device=row.device).view_as(row), -1),
-            tuple(source.index_select(0, selected) for source in self.sources),
         )
 
 
@@ -171,10 +161,8 @@ class MapEncoder(nn.Module):
         self.kind = nn.Embedding(NUM_FAMILIES, dim)
         self.light = nn.Embedding(NUM_LIGHTS, dim)
         self.relation = FourierEmbedding(3, dim, config.num_frequencies)
-        self.layers = nn.ModuleList(
-            RelationAttention(dim, config.num_heads, config.head_dim, config.dropout)
-            for _ in range(config.num_map_layers)
-        )
+        sizes = (dim, config.num_heads, config.head_dim, config.dropout)
+        self.layers = nn.ModuleList(RelationAttention(*sizes) for _ in range(config.num_map_layers))
 
     def forward(self, tokens: MapTokens, prototypes: Float[Tensor, "P 11 2"]) -> Float[Tensor, "BM D"]:
         """Features of all map tokens, scenario after scenario. Padding has arbitrary finite features.
@@ -245,15 +233,15 @@ class AgentDecoder(nn.Module):
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return tuple(module for module in (self.goal, self.aim) if module is not None)
 
-    def relations(self) -> Relations:
-        """The relation embeddings, tabulated unless a gradient has to be exact."""
+    def relations(self) -> dict[str, RelationEmbedding]:
+        """The relation embeddings by field of a scene, tabulated unless a gradient has to be exact."""
         # lags are whole numbers of tokens, so their grid has exactly these points
         lag = Grid(-float(self.config.history_tokens), 0.0, self.config.history_tokens + 1)
-        return Relations(
-            time=tabulate(self.time_relation, MAX_LOOK_BACK_M, lag),
-            map=tabulate(self.map_relation, self.config.agent_map_radius_m),
-            agent=tabulate(self.agent_relation, self.config.agent_radius_m),
-        )
+        return {
+            "time_relation": tabulate(self.time_relation, MAX_LOOK_BACK_M, lag),
+            "map_relation": tabulate(self.map_relation, self.config.agent_map_radius_m),
+            "agent_relation": tabulate(self.agent_relation, self.config.agent_radius_m),
+        }
 
     def embed_agents(self, class_id: Int64[Tensor, "B A"], size: Float[Tensor, "B A 3"]) -> Float[Tensor, "B A D"]:
         """Embedding of class and size.
@@ -282,13 +270,7 @@ class AgentDecoder(nn.Module):
         return tuple(layer.fold() for block in layers for layer in block)  # type: ignore[operator]
 
     def look(
-        self,
-        scene: Scene,
-        steps: TokenSteps,
-        past: Past | None,
-        hidden: Bool[Tensor, "B N A K"] | None = None,
-        *,
-        padded: bool = False,
+        self, scene: Scene, steps: TokenSteps, past: Past | None, hidden: Tensor | None = None, *, padded: bool = False
     ) -> View:
         """The rows of a block and their neighbors, which the layers only read.
 
@@ -298,7 +280,7 @@ class AgentDecoder(nn.Module):
             scene: Map, agents and embeddings of relations, in the frame of the steps.
             steps: Block of steps whose valid elements become rows.
             past: Past of earlier blocks; None = the block begins the scenario.
-            hidden: True = the (agent, step) pair takes no part in the attention over time.
+            hidden: True = the (agent, step) pair, of [B, N, A, K], takes no part in the attention over time.
             padded: Whether padding has rows, too, which no row attends to, and lists have fixed widths.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
@@ -307,7 +289,7 @@ class AgentDecoder(nn.Module):
         index = torch.arange(len(agent), device=agent.device)
         element_row = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]
         source_row = torch.where(element_row >= 0, element_row + num_sources, -1)
-        past = Past(steps.position, steps.heading, source_row, ()) if past is None else past.append(steps, source_row)
+        past = Past((), steps.position, steps.heading, source_row) if past is None else past.append(steps, source_row)
         poses = Poses(steps.position, steps.heading)[rows]
         build = partial(build_neighborhoods, dim=self.config.dim, padded=padded)
         # 2. map tokens. Agents that stand are at the same pose in many steps and rollouts, and share a list. But in
@@ -333,11 +315,11 @@ class AgentDecoder(nn.Module):
         agent_relation = relative_pose(poses, poses[agent_row], seam_rad=self.config.seam_rad)
         return View(
             rows, poses, past,
-            history=build(scene.relations.time, *self._find_history(past, steps, rows, poses, hidden)),
+            history=build(scene.time_relation, *self._find_history(past, steps, rows, poses, hidden)),
             map_tokens=build(
-                scene.relations.map, map_relation, tokens.index, tokens.mask, features=scene.map_features, groups=groups
+                scene.map_relation, map_relation, tokens.index, tokens.mask, features=scene.map_features, groups=groups
             ),
-            agents=build(scene.relations.agent, agent_relation, agent_row, agents.mask),
+            agents=build(scene.agent_relation, agent_relation, agent_row, agents.mask),
         )  # fmt: skip
 
     def forward(
@@ -364,7 +346,7 @@ class AgentDecoder(nn.Module):
             token that led to the step (E = D + F); and the past, followed by the block.
         """
         view = self.look(scene, steps, past) if view is None else view
-        x = self._embed_steps(scene, steps, view, goals)
+        x = self._embed(scene, steps, view, goals)
         goal_edges = self._build_goal_edges(scene, view, goals)
         # inputs of the attention over time are stored: later blocks attend to them
         sources, folded = [], itertools.repeat(None) if maps is None else iter(maps)
@@ -382,9 +364,7 @@ class AgentDecoder(nn.Module):
             x = torch.cat([x, scene.token_keys.last_phase[class_id, token_id]], -1)
         return x, replace(view.past, sources=tuple(sources))
 
-    def _embed_steps(
-        self, scene: Scene, steps: TokenSteps, view: View, goals: EncodedGoals | None
-    ) -> Float[Tensor, "R D"]:
+    def _embed(self, scene: Scene, steps: TokenSteps, view: View, goals: EncodedGoals | None) -> Float[Tensor, "R D"]:
         """Initial features: the token that led to a step, and motion, class, size and goal of the agent."""
         scenario, _, agent, _ = view.rows
         motion = steps.motion[view.rows]
@@ -453,6 +433,34 @@ class SmartNetwork(nn.Module):
         initialize(self, config.frequency_init)
         if self.decoder.goal is not None:
             self.decoder.goal.zero_init()
+
+    def build_scene(self, scenarios: ScenarioBatch, vocabulary: Vocabulary) -> Scene:
+        """Inputs of the decoder beside the agents' motion, from the maps and agents of a batch.
+
+        Args:
+            scenarios: Scenarios with maps and agents, map frame.
+            vocabulary: Motion tokens of the agents, and prototypes of map tokens.
+        """
+        tokens = tokenize_map(scenarios, vocabulary.map_prototypes)
+        class_id = class_of_type(scenarios.object_type)
+        decoder = self.decoder
+        max_map_tokens = None
+        if decoder.config.max_agent_map_neighbors is None and tokens.position.device.type != "cpu":
+            # the host waits for the bound once, and not at every decision
+            candidates = mask_positions(tokens.token_mask, tokens.position)
+            max_map_tokens = bound_neighbors(candidates, decoder.config.agent_map_radius_m)
+        return Scene(
+            map_position=tokens.position,
+            map_heading=tokens.heading,
+            map_mask=tokens.token_mask,
+            map_features=normalize(self.map_encoder(tokens, vocabulary.map_prototypes)),
+            class_id=class_id,
+            agent_features=decoder.embed_agents(class_id, scenarios.size),
+            token_features=decoder.embed_tokens(vocabulary.end_corners()),
+            token_keys=None if decoder.scores is None else decoder.scores.keys(vocabulary.poses[:, :, -1]),
+            **decoder.relations(),
+            max_map_tokens=max_map_tokens,
+        )
 
     def scene_weights(self) -> list[Tensor]:
         """Weights that scenes and views are made with: all but those of the decoder's `reader_modules`."""

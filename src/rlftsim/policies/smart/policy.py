@@ -1,31 +1,107 @@
 """SMART as a policy: every agent chooses a motion token of half a second, sixteen times.
 
-The five methods of `rollout.policy.Policy`, and pre-training; `SmartModel` has weights and files.
+The five methods of `rollout.policy.Policy`, with their contexts and states, and pre-training; `SmartModel` has weights
+and files.
 
 B scenarios, N rollouts, A agents, L decisions, K token steps, D width, R selected elements, V tokens.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.goals.types import Goals
 from rlftsim.policies.distributions import CategoricalDistribution, TokenDistribution
-from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, encode_goals
+from rlftsim.policies.smart.attention import AttentionMaps
+from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, EncodedGoals, encode_goals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
-from rlftsim.policies.smart.network import View, mask_positions
-from rlftsim.policies.smart.state import SmartContext, SmartState, TeacherForced
+from rlftsim.policies.smart.network import Past, Scene, View, mask_positions
 from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions
 from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.tokens.agent_tokens import HISTORY_TOKENS
+from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, restart_at_log
 from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_type
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """Features and geometry that do not depend on the agents' decisions, computed once per scenario."""
+
+    scene: Scene
+    history: TokenSteps
+    """The two history tokens of a single rollout. The last ends at the current step, near the logged pose or at it."""
+    view: View
+    """Of the history."""
+    past: Past
+    """Of the history."""
+    features: Float[Tensor, "B A D"]
+    """Decoder features at the current step of goal-free agents; zeros for padding."""
+    object_type: Int64[Tensor, "B A"]
+    token_class: Int64[Tensor, "B A"]
+    """Class that an agent's token ids refer to."""
+    agent_mask: Bool[Tensor, "B A"]
+    model: nn.Module
+    """The model that encoded the scenario."""
+
+    @cached_property
+    def maps(self) -> tuple[AttentionMaps, ...]:
+        """Maps of the decoder's attention, folded once for all decisions."""
+        return self.model.network.decoder.fold()  # type: ignore[union-attr, operator]
+
+    @property
+    def is_padded(self) -> bool:
+        """True off the CPU: in closed loop padding is simulated, too. The host would wait to leave padding out."""
+        return self.agent_mask.device.type != "cpu"
+
+
+@dataclass(eq=False)
+class DecoderCache:
+    """Decoder outputs of a state, filled at the first use: a memo of values that follow from the state."""
+
+    features: Float[Tensor, "B N A D"] | None = None
+    """Decoder features at the state's last step."""
+    past: Past | None = None
+    """The past that includes the state's last step."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Running simulations.
+
+    Steps that have not been through the decoder wait in `pending`, and go through the decoder at most once.
+    """
+
+    position: Float[Tensor, "B N A 2"]
+    heading: Float[Tensor, "B N A"]
+    past: Past
+    pending: TokenSteps | None
+    poses: Float[Tensor, "B N A 5 3"] | None = None
+    draws: Tensor | None = None
+    goals: EncodedGoals | None = None
+    """None = no agent has a goal, or the model is goal-free."""
+    num_decisions: int = 0
+    """Decisions taken so far."""
+    cache: DecoderCache = field(default_factory=DecoderCache)
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherForced:
+    """Predictions along logged tracks, and the tokens of the log."""
+
+    logits: Float[Tensor, "R V"]
+    target: Int64[Tensor, "R"]
+    """Token that came next."""
+    target_mask: Bool[Tensor, "R"]
+    """True = the next state was logged and the agent is trained on."""
+    class_id: Int64[Tensor, "R"]
+    """Agent class that each row's token ids refer to."""
 
 
 class SmartPolicy(SmartModel):
@@ -46,14 +122,14 @@ class SmartPolicy(SmartModel):
         goals = "follows goals" if self.is_goal_conditioned else "follows no goals"
         return f"{type(self).__name__}({sum(weight.numel() for weight in self.parameters()):,} weights, {goals})"
 
-    def encode(self, scenarios: ScenarioBatch) -> SmartContext:
+    def encode(self, scenarios: ScenarioBatch) -> Context:
         """Map features, history tokens and decoder features, for goal-free agents."""
-        tokens = self._tokenize(scenarios)
+        tokens = restart_at_log(self._tokenize(scenarios), scenarios, self.vocabulary)
         scene = self._build_scene(scenarios)
-        history = self._logged_steps(tokens, slice(0, HISTORY_TOKENS))
+        history = self._logged_steps(tokens, slice(HISTORY_TOKENS))
         view = self.network.decoder.look(scene, history, None)
         rows, past = self.network.decoder(scene, history, None, view)
-        return SmartContext(
+        return Context(
             scene=scene,
             history=history,
             view=view,
@@ -65,7 +141,7 @@ class SmartPolicy(SmartModel):
             model=self,
         )
 
-    def begin(self, context: SmartContext, num_rollouts: int, goals: Goals | None, noise: Tensor) -> SmartState:
+    def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current step, N times, without copies of the history.
 
         Args:
@@ -77,9 +153,9 @@ class SmartPolicy(SmartModel):
         current = context.history.last.repeat(num_rollouts)
         position, heading = current.position[:, :, :, 0], current.heading[:, :, :, 0]
         if goals is None or not self.is_goal_conditioned or not goals.any:
-            return SmartState(position, heading, context.past.repeat(num_rollouts), pending=None)
+            return State(position, heading, context.past.repeat(num_rollouts), pending=None)
         # the context is goal-free: the current step goes through the decoder again, with goals; earlier steps do not
-        return SmartState(
+        return State(
             position,
             heading,
             context.past.without_last_step().repeat(num_rollouts),
@@ -87,7 +163,7 @@ class SmartPolicy(SmartModel):
             goals=encode_goals(goals, mask_positions(context.scene.map_mask, context.scene.map_position)),
         )
 
-    def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
+    def decide(self, context: Context, state: State) -> TokenDistribution:
         """Distributions [B, N, A] of the next token of every agent.
 
         Args:
@@ -103,12 +179,8 @@ class SmartPolicy(SmartModel):
         return TokenDistribution(dist.logits, mask)
 
     def advance(
-        self,
-        context: SmartContext,
-        state: SmartState,
-        decision: Int64[Tensor, "B N A"],
-        forced: AgentStates | None = None,
-    ) -> SmartState:
+        self, context: Context, state: State, decision: Int64[Tensor, "B N A"], forced: AgentStates | None = None
+    ) -> State:
         """State after the chosen token's five poses. The decoder is not run, the step waits in `pending`.
 
         Args:
@@ -136,9 +208,9 @@ class SmartPolicy(SmartModel):
         elif state.pending is not None:
             pending = state.pending.append(block)
         num_decisions = state.num_decisions + 1
-        return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
+        return State(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
-    def score(self, context: SmartContext, rollouts: Rollouts) -> CategoricalDistribution:
+    def score(self, context: Context, rollouts: Rollouts) -> CategoricalDistribution:
         """Distributions [B, N, A, L] along rollouts: a single pass of the decoder over all steps.
 
         Args:
@@ -147,7 +219,7 @@ class SmartPolicy(SmartModel):
         """
         return self._score(context, *self._replay(context, rollouts))
 
-    def _replay(self, context: SmartContext, rollouts: Rollouts) -> tuple[SmartState, View | None]:
+    def _replay(self, context: Context, rollouts: Rollouts) -> tuple[State, View | None]:
         """State before the last decision of rollouts, and a view of the steps, all pending; None = there are none.
 
         The decoder is not run: but for the past, no value depends on weights that fine-tuning trains.
@@ -161,7 +233,7 @@ class SmartPolicy(SmartModel):
         steps = state.pending
         return state, None if steps is None else self.network.decoder.look(context.scene, steps, state.past)
 
-    def _score(self, context: SmartContext, state: SmartState, view: View | None) -> CategoricalDistribution:
+    def _score(self, context: Context, state: State, view: View | None) -> CategoricalDistribution:
         """Distributions along rollouts that have been replayed, by this model or by a model that sees alike."""
         # 1. features [B, N, A, L, D]: of the current step, from the context for goal-free agents, and of later steps
         blocks = []
@@ -183,21 +255,21 @@ class SmartPolicy(SmartModel):
 
     # ---- passes that share scenes and views -------------------------------------------------------------------------
 
-    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> SmartContext:
+    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> Context:
         """`encode(scenarios)`, with scene and history taken over from a context of a model that sees alike.
 
         Args:
             scenarios: Scenarios that `context` was encoded from, in the same order.
             context: Context of any policy with weights that have not changed since.
         """
-        if not isinstance(context, SmartContext) or not self.sees_as(context.model):
+        if not isinstance(context, Context) or not self.sees_as(context.model):
             return self.encode(scenarios)
         rows, past = self.network.decoder(context.scene, context.history, None, context.view)
         features = place_rows(rows, context.history.valid)[:, 0, :, -1]
         return replace(context, past=past, features=features, model=self)
 
     def score_with_reference(
-        self, context: SmartContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
+        self, context: Context, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[CategoricalDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
@@ -213,7 +285,7 @@ class SmartPolicy(SmartModel):
         replay = self._replay(context, rollouts)
         dist = self._score(context, *replay)
         with torch.no_grad():
-            is_shared = isinstance(ref_context, SmartContext) and ref_context.scene is context.scene
+            is_shared = isinstance(ref_context, Context) and ref_context.scene is context.scene
             if is_shared and ref_rollouts is rollouts:
                 return dist, reference._score(ref_context, *replay)
             return dist, reference.score(ref_context, ref_rollouts)
@@ -246,7 +318,7 @@ class SmartPolicy(SmartModel):
 
     # ---- passes of the decoder and the head -----------------------------------------------------------------------
 
-    def _compute_features(self, context: SmartContext, state: SmartState) -> Float[Tensor, "B N A D"]:
+    def _compute_features(self, context: Context, state: State) -> Float[Tensor, "B N A D"]:
         """Decoder features at the state's last step, from the cache after the first call."""
         cache = state.cache
         if cache.features is None:
@@ -263,8 +335,8 @@ class SmartPolicy(SmartModel):
 
     def _build_distribution(
         self,
-        context: SmartContext,
-        state: SmartState,
+        context: Context,
+        state: State,
         features: Float[Tensor, "R D"],
         mask: Bool[Tensor, "*batch"],
         poses: Poses | None,

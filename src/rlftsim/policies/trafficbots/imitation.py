@@ -22,8 +22,6 @@ from torch import Tensor
 from torch.nn.functional import pad, smooth_l1_loss
 
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
-from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
-from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.network import (
     POSTERIOR_STRIDE,
     AgentConditioning,
@@ -32,8 +30,8 @@ from rlftsim.policies.trafficbots.network import (
     Windows,
     history_windows,
 )
-from rlftsim.policies.trafficbots.scene import Scene, build_scene
-from rlftsim.policies.trafficbots.state import ImposedStates, join_history, start_traffic
+from rlftsim.policies.trafficbots.scene import NO_DESTINATION, Scene, build_scene, destination_labels
+from rlftsim.policies.trafficbots.state import ImposedStates, join_history, max_action, move, start_traffic
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, TOTAL_STEPS
@@ -42,7 +40,7 @@ POSITION_WEIGHT, HEADING_WEIGHT, SPEED_WEIGHT, PERSONALITY_WEIGHT = 0.1, 10.0, 0
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingDraws:
+class Draws:
     """All random values of an update."""
 
     noise: Float[Tensor, "B A 16"]
@@ -58,23 +56,18 @@ class TrainingDraws:
 
 
 def imitation_loss(
-    network: TrafficBotsNetwork,
-    config: TrafficBotsConfig,
-    batch: ScenarioBatch,
-    trained: Bool[Tensor, "B A"],
-    update: int,
+    network: TrafficBotsNetwork, batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int
 ) -> ImitationLoss:
     """Loss of an update, a sum of means over each scenario.
 
     Args:
-        network: Network with the weights. In training mode inputs are hidden and agents forced by schedule; in
-            evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
-        config: Settings with the schedule of forcing, and probabilities.
+        network: Network with weights and settings. In training mode inputs are hidden and agents forced by schedule;
+            in evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
         batch: Scenarios with logged futures, the targets of imitation.
         trained: True = the agent counts; other agents are context.
         update: Number of the update of pre-training from 0.
     """
-    scene = build_scene(batch, TOTAL_STEPS, config.max_map_tokens)
+    config, scene = network.config, build_scene(batch, TOTAL_STEPS, network.config.max_map_tokens)
     labels = np.full(trained.shape, NO_DESTINATION)
     for row, scenario in zip(labels, batch.scenarios):
         destinations = destination_labels(scenario, config.max_map_tokens)
@@ -84,10 +77,10 @@ def imitation_loss(
     stage = min(update // config.forcing_updates, stages) if network.training else stages
     draws = draw_training(scene, config, config.forced_fractions[stage], hide=network.training)
     destination = torch.from_numpy(labels).to(trained.device)
-    return compute_scene_loss(network, config, scene, destination, trained & scene.agent_mask, draws)
+    return compute_scene_loss(network, scene, destination, trained & scene.agent_mask, draws)
 
 
-def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, hide: bool) -> TrainingDraws:
+def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, hide: bool) -> Draws:
     """Draw all random values of an update with torch's generator.
 
     Args:
@@ -107,24 +100,18 @@ def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, h
         nodes, steps = (torch.rand(mask.shape).to(device) >= config.input_drop for mask in (node_mask, history_mask))
         nodes[..., 0], steps[..., -1] = True, True
         node_mask, history_mask = node_mask & nodes, history_mask & steps
-    return TrainingDraws(noise, from_prior, forced, node_mask, history_mask)
+    return Draws(noise, from_prior, forced, node_mask, history_mask)
 
 
 def compute_scene_loss(
-    network: TrafficBotsNetwork,
-    config: TrafficBotsConfig,
-    scene: Scene,
-    destination: Int64[Tensor, "B A"],
-    trained: Bool[Tensor, "B A"],
-    draws: TrainingDraws,
+    network: TrafficBotsNetwork, scene: Scene, labels: Int64[Tensor, "B A"], trained: Bool[Tensor, "B A"], draws: Draws
 ) -> ImitationLoss:
     """Loss of a scene with random values that have been drawn.
 
     Args:
         network: Network with the weights to be trained.
-        config: Settings with `free_nats` and `steps_per_pass`.
         scene: Scene with all 91 steps of the log.
-        destination: Label of each agent, a map token; negative = none.
+        labels: Map token of each agent's destination; negative = none.
         trained: True = the agent counts; other agents are context.
         draws: Random values, from `draw_training`.
     """
@@ -136,26 +123,24 @@ def compute_scene_loss(
     mean = network.posterior(windows, scene.light_state[:, None, :, steps], scene, map_features)
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
-    conditioning = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
-    context = network.agents.context(map_features, light_features[:, CURRENT_STEP:])
+    conditioning = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
+    context = network.agents.context(scene, map_features, light_features[:, CURRENT_STEP:])
 
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
-    rollout = _roll_out(network, scene, context, conditioning, destination[:, None], draws.forced)
+    rollout = _roll_out(network, context, conditioning, labels[:, None], draws.forced)
     value, grad = _differentiate_actions(scene, rollout, trained)
-    features = network.features_over_time(
-        rollout.history, rollout.active, scene, context, conditioning, steps_per_pass=config.steps_per_pass
-    )  # [B, T, 1, A, D]
+    features = network.features_over_time(rollout.history, rollout.active, context, conditioning)  # [B, T, 1, A, D]
     actions = network.mean_actions(features, scene).movedim(1, 3)  # [B, 1, A, T, 2]
     surrogate = (actions * grad).sum()
 
     # 3. Terms of values that are drawn once, for agents that are simulated at all.
     counts = trained & rollout.alive.any(-1)[:, 0]
     log_prob = network.destination_predictor(history_windows(scene), scene, map_features, draws.history_mask)
-    nll = -log_prob.gather(-1, destination.clamp(min=0)[..., None])[..., 0]  # [B, A]
+    nll = -log_prob.gather(-1, labels.clamp(min=0)[..., None])[..., 0]  # [B, A]
     losses = {
         "imitation_loss": value + (surrogate - surrogate.detach()),  # value of the loss, gradient of the sum
-        "personality_loss": _average_by_scenario(personality_kl(mean, log_std, config.free_nats), counts),
-        "destination_loss": _average_by_scenario(nll, counts & (destination >= 0) & nll.isfinite()),
+        "personality_loss": _average_by_scenario(personality_kl(mean, log_std, network.config.free_nats), counts),
+        "destination_loss": _average_by_scenario(nll, counts & (labels >= 0) & nll.isfinite()),
         "light_loss": light_loss,
     }
     sums = {name: value.detach() for name, value in losses.items()}
@@ -212,18 +197,17 @@ class _Rollout:
 @torch.no_grad()
 def _roll_out(
     network: TrafficBotsNetwork,
-    scene: Scene,
     context: AgentContext,
     conditioning: AgentConditioning,
     destination: Int64[Tensor, "B 1 A"],
     forced: Bool[Tensor, "B A"],
 ) -> _Rollout:
-    traffic = start_traffic(scene, destination)
+    scene, traffic = context.scene, start_traffic(context.scene, destination)
     states, actions, imposed_masks = [], [], []
     for index in range(FUTURE_STEPS):
         states.append(traffic)
         windows, lights = traffic.windows.add_decision_axis(), context.select_steps(slice(index, index + 1))
-        features = network.features(windows, scene, lights, conditioning, traffic.active[:, None])  # [B, 1, 1, A, D]
+        features = network.features(windows, lights, conditioning, traffic.active[:, None])  # [B, 1, 1, A, D]
         action = network.mean_actions(features, scene)[:, 0]
         step = CURRENT_STEP + index + 1
         logged = scene.valid[:, None, :, step]

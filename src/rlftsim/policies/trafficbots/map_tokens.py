@@ -6,15 +6,14 @@ Shapes: M map tokens, L light tokens, S logged steps. The rules are those of Tra
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightState, MapFeatureType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightState, MapFeatureType, Scenario, cached_on_scenario
 
 NUM_NODES = 20
 """Largest number of nodes (segments) of a token."""
@@ -134,7 +133,7 @@ def tokenize_map(scenario: Scenario, max_tokens: int | None = 1024) -> MapTokens
     """
     features, pose = scenario.map_features, ego_pose(scenario)
     stop_sign_lanes = set(features.topology.stop_sign_lanes[:, 1].tolist())
-    positions, directions, types, ids = [], [], [], []
+    rows = []
     for index, (feature_id, feature_type) in enumerate(zip(features.feature_id, features.feature_type)):
         token_type = _TOKEN_TYPES.get(MapFeatureType(feature_type))
         if token_type is None:  # a stop sign
@@ -148,12 +147,9 @@ def tokenize_map(scenario: Scenario, max_tokens: int | None = 1024) -> MapTokens
             lines = [features.polyline(index)[::2].astype(np.float64)]
         for line in lines:
             line = to_ego_frame(line, pose)
-            for segments in cut_line(len(line) - 1):
-                if len(segments) >= MIN_NODES:
-                    positions.append(line[segments])
-                    directions.append(line[segments + 1] - line[segments])
-                    types.append(int(token_type))
-                    ids.append(int(feature_id))
+            pieces = (segments for segments in cut_line(len(line) - 1) if len(segments) >= MIN_NODES)
+            rows += [(line[piece], line[piece + 1] - line[piece], int(token_type), int(feature_id)) for piece in pieces]
+    positions, directions, types, ids = zip(*rows) if rows else ((), (), (), ())
     counts = np.array([len(p) for p in positions], np.int64)
     mask = np.arange(NUM_NODES) < counts[:, None]  # [M, 20]
     types, ids = np.array(types, np.int64), np.array(ids, np.int64)
@@ -198,7 +194,7 @@ def tokenize_lights(scenario: Scenario, max_tokens: int | None = 1024, *, of_his
         of_history: True leaves out lights that were not observed up to the current step, as a simulation must.
     """
     lights, map_tokens = scenario.lights, tokenize_map(scenario, max_tokens)
-    tokens, observed, states = [], [], []
+    rows = []
     for lane in np.unique(lights.lane_id):
         is_of_lane = (lights.lane_id == lane) & (lights.step < scenario.num_steps)
         is_observed, state = np.zeros(scenario.num_steps, bool), np.full(scenario.num_steps, UNKNOWN_LIGHT)
@@ -206,17 +202,15 @@ def tokenize_lights(scenario: Scenario, max_tokens: int | None = 1024, *, of_his
         state[lights.step[is_of_lane]] = [_LIGHT_STATES[LightState(s)] for s in lights.state[is_of_lane]]
         if not is_observed[: HISTORY_STEPS if of_history else None].any():
             continue
-        for token in np.flatnonzero(map_tokens.feature_id == lane):
-            tokens.append(token)
-            observed.append(is_observed)
-            states.append(state)
+        rows += [(token, is_observed, state) for token in np.flatnonzero(map_tokens.feature_id == lane)]
+    tokens, observed, states = zip(*rows) if rows else ((), (), ())
     shape = (len(tokens), scenario.num_steps)
     return LightTokens(
         np.array(tokens, np.int64), np.array(observed, bool).reshape(shape), np.array(states, np.int64).reshape(shape)
     )
 
 
-def _pad_nodes(mask: Bool[np.ndarray, "M 20"], nodes: list[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:
+def _pad_nodes(mask: Bool[np.ndarray, "M 20"], nodes: Sequence[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:
     padded = np.zeros((*mask.shape, 3))
     padded[mask] = np.concatenate([np.zeros((0, 3)), *nodes])
     return padded
@@ -234,9 +228,7 @@ def _find_relevant_positions(scenario: Scenario) -> Float64[np.ndarray, "n 3"]:
     return to_ego_frame(tracks.position[:, :HISTORY_STEPS][is_logged].astype(np.float64), ego_pose(scenario))
 
 
-def _select_tokens(
-    tokens: MapTokens, agents: Float64[np.ndarray, "n 3"], max_tokens: int | None
-) -> Int64[np.ndarray, "m"]:
+def _select_tokens(tokens: MapTokens, agents: Float64[np.ndarray, "n 3"], limit: int | None) -> Int64[np.ndarray, "m"]:
     """Indices of the tokens near agents."""
     # 1. Some node inside of the agents' bounding box, grown by the margins.
     low, high = agents.min(0), agents.max(0)
@@ -248,11 +240,11 @@ def _select_tokens(
         is_selected[:] = True
     # 2. Still too many: in file order, tokens with both ends beyond a radius that is halved again and again.
     radius = MAP_MARGIN_M
-    while max_tokens is not None and is_selected.sum() > max_tokens:
+    while limit is not None and is_selected.sum() > limit:
         last = tokens.node_mask.sum(1) - 1
         ends = np.stack([tokens.position[:, 0], tokens.position[np.arange(len(tokens)), last]], 1)  # [M, 2, 3]
         distance = np.linalg.norm(ends[:, :, None] - agents, axis=-1).min((1, 2))
         distant_tokens = np.flatnonzero(is_selected & (distance >= radius))
-        is_selected[distant_tokens[: is_selected.sum() - max_tokens]] = False
+        is_selected[distant_tokens[: is_selected.sum() - limit]] = False
         radius /= 2
     return np.flatnonzero(is_selected)

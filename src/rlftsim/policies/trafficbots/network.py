@@ -6,7 +6,7 @@ Shapes: B scenarios, T decisions, N rollouts, A agents, W steps of a window, M m
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
 from typing import cast
@@ -17,11 +17,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from rlftsim.policies.precision import at_least_float32
-from rlftsim.policies.trafficbots.attention import DecoderLayer, KeyValues, PolylineEncoder, SelfLayer
+from rlftsim.policies.distributions import at_least_float32
+from rlftsim.policies.trafficbots.attention import (
+    DecoderLayer,
+    KeyValues,
+    Neighbors,
+    PolylineEncoder,
+    SelfLayer,
+    find_neighbors,
+    pose_embedding,
+    relative_pose,
+)
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, WINDOW, TrafficBotsConfig
 from rlftsim.policies.trafficbots.map_tokens import NUM_LIGHT_STATES, NUM_NODES, VEHICLE_LANES, MapTokenType
-from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.scenario.types import TOTAL_STEPS
 
@@ -65,9 +73,8 @@ class MapEncoder(nn.Module):
         self.config = config
         self.nodes = mlp(len(MapTokenType) + NUM_NODES, width, width, width)
         self.polyline = PolylineEncoder(config.dim, config.dropout)
-        self.layers = nn.ModuleList(
-            SelfLayer(config.dim, config.num_heads, config.dropout) for _ in range(config.num_map_layers)
-        )
+        sizes = (config.dim, config.num_heads, config.dropout)
+        self.layers = nn.ModuleList(SelfLayer(*sizes) for _ in range(config.num_map_layers))
 
     def forward(self, scene: Scene, node_mask: Bool[Tensor, "B M 20"]) -> Float[Tensor, "B M D"]:
         """Features of all map tokens, 0 for padding.
@@ -83,12 +90,12 @@ class MapEncoder(nn.Module):
         attributes = torch.cat([v.expand(*shape, -1) for v in (map_type, node_index)], -1)  # [B, M, 20, 31]
         geometry = segment_features(relative_pose(scene.node_pose, scene.map_pose[..., None, :]))
         x = self.polyline(torch.cat([self.nodes(attributes), geometry], -1), node_mask)
+        poses, mask = scene.map_pose, scene.map_mask
         neighbors = find_neighbors(
-            scene.map_pose, scene.map_pose, scene.map_mask,
-            count=config.map_neighbors, radius_m=config.radius_m, size=config.dim,
-        )  # fmt: skip
+            poses, poses, mask, count=config.map_neighbors, radius_m=config.radius_m, size=config.dim
+        )
         for layer in self.layers:
-            x = layer(x, scene.map_mask, neighbors)
+            x = layer(x, mask, neighbors)
         return x
 
 
@@ -108,7 +115,7 @@ def segment_features(pose: Float[Tensor, "*g 3"]) -> Float[Tensor, "*g 7"]:
 
 
 @dataclass(frozen=True, eq=False)
-class LightNeighborhoods:
+class LightNeighbors:
     """Lights and the neighbors of lights."""
 
     base: Float[Tensor, "B L D"]
@@ -130,11 +137,10 @@ class LightEncoder(nn.Module):
         self.window = window
         self.states = mlp(NUM_LIGHT_STATES + window, dim, dim, dim)
         self.polyline = PolylineEncoder(dim, config.dropout)
-        self.layers = nn.ModuleList(
-            DecoderLayer(dim, config.num_heads, config.dropout) for _ in range(config.num_light_layers)
-        )
+        sizes = (dim, config.num_heads, config.dropout)
+        self.layers = nn.ModuleList(DecoderLayer(*sizes) for _ in range(config.num_light_layers))
 
-    def neighborhoods(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightNeighborhoods:
+    def neighborhoods(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightNeighbors:
         """Values that the states of lights do not change, computed once.
 
         Args:
@@ -144,7 +150,7 @@ class LightEncoder(nn.Module):
         config, map_features = self.config, map_features.detach()
         lights = scene.light_pose
         find = partial(find_neighbors, count=config.light_neighbors, radius_m=config.light_radius_m, size=config.dim)
-        return LightNeighborhoods(
+        return LightNeighbors(
             base=map_features.gather(1, scene.light_token[..., None].expand(-1, -1, config.dim)),
             mask=scene.light_mask,
             lights=find(lights, lights, scene.light_mask),
@@ -153,27 +159,24 @@ class LightEncoder(nn.Module):
         )
 
     def forward(
-        self,
-        state: Int64[Tensor, "B T L W"],
-        neighborhoods: LightNeighborhoods,
-        step_mask: Bool[Tensor, "T W"] | None = None,
+        self, state: Int64[Tensor, "B T L W"], neighbors: LightNeighbors, step_mask: Bool[Tensor, "T W"] | None = None
     ) -> Float[Tensor, "B T L D"]:
         """Features of all lights at T decisions, 0 for padding.
 
         Args:
             state: States of the lights in each window, the newest last.
-            neighborhoods: Result of `neighborhoods` for the same scene.
+            neighbors: Result of `neighborhoods` for the same scene.
             step_mask: True = the step of the window exists; None = all steps exist.
         """
-        base, num_decisions = neighborhoods.base, state.shape[1]
+        base, num_decisions = neighbors.base, state.shape[1]
         step_index = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
         attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).to(base), step_index], -1)
-        mask = neighborhoods.mask[:, None].expand(state.shape[:3])  # [B, T, L]
+        mask = neighbors.mask[:, None].expand(state.shape[:3])  # [B, T, L]
         x = self.states(attributes) + base[:, None, :, None]
         steps = mask[..., None].expand(state.shape)
         x = self.polyline(x, steps if step_mask is None else steps & step_mask[:, None])
-        lights, map_neighbors = (n.over_time(num_decisions) for n in (neighborhoods.lights, neighborhoods.map))
-        for layer, map_tokens in zip(self.layers, neighborhoods.map_tokens):
+        lights, map_neighbors = (n.over_time(num_decisions) for n in (neighbors.lights, neighbors.map))
+        for layer, map_tokens in zip(self.layers, neighbors.map_tokens):
             x = layer(x, mask, lights, [(map_tokens, map_neighbors)])
         return x
 
@@ -252,8 +255,9 @@ def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
 
 @dataclass(frozen=True, eq=False)
 class AgentContext:
-    """Map and lights as keys and values of an agent encoder, by layer."""
+    """Scene of agents, with map and lights as keys and values of an agent encoder, by layer."""
 
+    scene: Scene
     map_tokens: tuple[KeyValues, ...]
     """Keys and values [B, H, M, d]."""
     light_tokens: tuple[KeyValues, ...]
@@ -261,7 +265,7 @@ class AgentContext:
 
     def select_steps(self, steps: slice) -> "AgentContext":
         """The same context with the lights of a range of decisions."""
-        return AgentContext(self.map_tokens, tuple(lights.select_steps(steps) for lights in self.light_tokens))
+        return replace(self, light_tokens=tuple(lights.select_steps(steps) for lights in self.light_tokens))
 
 
 class AgentEncoder(nn.Module):
@@ -271,30 +275,31 @@ class AgentEncoder(nn.Module):
         super().__init__()
         self.config = config
         self.windows = WindowEncoder(config.dim, window, dropout)
-        self.layers = nn.ModuleList(
-            DecoderLayer(config.dim, config.num_heads, dropout) for _ in range(config.num_agent_layers)
-        )
+        sizes = (config.dim, config.num_heads, dropout)
+        self.layers = nn.ModuleList(DecoderLayer(*sizes) for _ in range(config.num_agent_layers))
 
-    def context(self, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]) -> AgentContext:
+    def context(
+        self, scene: Scene, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]
+    ) -> AgentContext:
         """Keys and values of map and lights for each layer, computed once for all rollouts.
 
         Args:
+            scene: Scene with poses of map and lights, sizes and classes of agents.
             map_features: Features of the map tokens, from `MapEncoder`.
             light_features: Features of the lights at T decisions, from `LightEncoder`.
         """
         layers = decoder_layers(self.layers)
         map_tokens, light_tokens = ([layer.project(f) for layer in layers] for f in (map_features, light_features))
-        return AgentContext(tuple(map_tokens), tuple(light_tokens))
+        return AgentContext(scene, tuple(map_tokens), tuple(light_tokens))
 
-    def forward(self, windows: Windows, scene: Scene, context: AgentContext) -> Float[Tensor, "B T N A D"]:
+    def forward(self, windows: Windows, context: AgentContext) -> Float[Tensor, "B T N A D"]:
         """Features of all agents at T decisions of N rollouts, 0 for agents without a valid step in the window.
 
         Args:
             windows: Windows [B, T, N, A, W] of the agents.
-            scene: Scene with poses of map and lights, sizes and classes of agents.
             context: Result of `context` for the same T decisions.
         """
-        config, mask, pose = self.config, windows.token_mask, windows.token_pose
+        config, scene, mask, pose = self.config, context.scene, windows.token_mask, windows.token_pose
         num_decisions = mask.shape[1]
         find = partial(find_neighbors, pose, radius_m=config.radius_m, size=config.dim)
         map_neighbors = find(scene.map_pose, scene.map_mask, count=config.agent_map_neighbors)
@@ -423,23 +428,19 @@ class Posterior(nn.Module):
         self.log_std = nn.Parameter(torch.zeros(LATENT_SIZE))
 
     def forward(
-        self,
-        windows: Windows,
-        light_state: Int64[Tensor, "B 1 L W"],
-        scene: Scene,
-        map_features: Float[Tensor, "B M D"],
+        self, windows: Windows, states: Int64[Tensor, "B 1 L W"], scene: Scene, map_features: Float[Tensor, "B M D"]
     ) -> Float[Tensor, "B A 16"]:
         """Means of a diagonal Gaussian with log standard deviations `log_std`.
 
         Args:
             windows: Windows [B, 1, 1, A, 19] of every fifth step of the log.
-            light_state: States of the lights at the same steps.
+            states: States of the lights at the same steps.
             scene: Scene with map, sizes and classes.
             map_features: Features from `MapEncoder`; receive gradient from agents, none from lights.
         """
-        lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
-        context = self.agents.context(map_features, lights)
-        return at_least_float32(self.mean(self.agents(windows, scene, context)[:, 0, 0]))
+        lights = self.lights(states, self.lights.neighborhoods(scene, map_features))
+        context = self.agents.context(scene, map_features, lights)
+        return at_least_float32(self.mean(self.agents(windows, context)[:, 0, 0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -457,7 +458,7 @@ class TrafficBotsNetwork(nn.Module):
 
     def __init__(self, config: TrafficBotsConfig):
         super().__init__()
-        dim = config.dim
+        self.config, dim = config, config.dim
         self.map = MapEncoder(config)
         self.lights = LightEncoder(config, WINDOW)
         self.light_state = mlp(dim, dim, dim, NUM_LIGHT_STATES)
@@ -498,57 +499,43 @@ class TrafficBotsNetwork(nn.Module):
         return logits.clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
 
     def features(
-        self,
-        windows: Windows,
-        scene: Scene,
-        context: AgentContext,
-        conditioning: AgentConditioning,
-        active: Bool[Tensor, "B T N A"],
+        self, windows: Windows, context: AgentContext, conditioning: AgentConditioning, active: Bool[Tensor, "B T N A"]
     ) -> Float[Tensor, "B T N A D"]:
         """Features of agents that `mean_actions` decides by.
 
         Args:
             windows: Windows [B, T, N, A, 11] of the agents.
-            scene: Scene with map, lights, sizes and classes.
-            context: Map, and lights at the same T decisions.
+            context: Scene with the map, and lights at the same T decisions.
             conditioning: Personality and destination of each agent.
             active: True = the agent has not reached the destination yet.
         """
-        x = self.agents(windows, scene, context)
+        x = self.agents(windows, context)
         relative = relative_pose(conditioning.destination_pose[:, None], windows.pose[..., -1, :])  # [B, T, N, A, 3]
         pose = self.destination_pose(pose_embedding(relative, x.shape[-1]))
         x = self.add_destination(x, conditioning.destination_feature[:, None] + pose, active)
         return self.add_personality(x, conditioning.personality[:, None])
 
     def features_over_time(
-        self,
-        history: Windows,
-        active: Bool[Tensor, "B N A T"],
-        scene: Scene,
-        context: AgentContext,
-        conditioning: AgentConditioning,
-        *,
-        steps_per_pass: int,
+        self, history: Windows, active: Bool[Tensor, "B N A T"], context: AgentContext, conditioning: AgentConditioning
     ) -> Float[Tensor, "B T N A D"]:
-        """`features` at all decisions of finished rollouts, in a few parallel passes; differentiable.
+        """`features` at all decisions of finished rollouts, in passes of `steps_per_pass`; differentiable.
 
         The network has no state: a decision depends on the last 11 steps alone.
 
         Args:
             history: Agents [B, N, A, W - 1 + T] from the first step of the first decision's window on.
             active: True = the agent has not reached the destination yet at this decision.
-            scene: Scene with map, lights, sizes and classes.
-            context: Map, and lights at the same T decisions.
+            context: Scene with the map, and lights at the same T decisions.
             conditioning: Personality and destination of each agent.
-            steps_per_pass: Number of decisions in memory at once with gradient; changes memory and time only.
         """
         # [B, N, A, T, ..., W] -> [B, T, N, A, W, ...]
         windows = history.apply(lambda v: v.unfold(3, WINDOW, 1).movedim(3, 1).movedim(-1, 4))
-        passes = [slice(start, start + steps_per_pass) for start in range(0, active.shape[-1], steps_per_pass)]
+        size = self.config.steps_per_pass
+        passes = [slice(start, start + size) for start in range(0, active.shape[-1], size)]
         features = []
         for steps in passes:
             selected = windows.apply(lambda v, steps=steps: v[:, steps])
-            inputs = (selected, scene, context.select_steps(steps), conditioning, active.movedim(3, 1)[:, steps])
+            inputs = (selected, context.select_steps(steps), conditioning, active.movedim(3, 1)[:, steps])
             if torch.is_grad_enabled() and len(passes) > 1:
                 # Each pass is computed again in the backward pass, so that memory holds a single pass.
                 result = checkpoint(self.features, *inputs, use_reentrant=False, preserve_rng_state=False)

@@ -1,8 +1,9 @@
-"""Values of a TrafficBots policy: the context of a scene and the state of running simulations.
+"""Values of a TrafficBots policy: the context of a scene and the state of running simulations, which actions move.
 
 Shapes: B scenarios, N rollouts, A agents, T decisions, M map tokens, W = 11 steps of a window, D width.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -11,11 +12,80 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.geometry import heading_vector, wrap_angle
-from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
+from rlftsim.policies.trafficbots.map_tokens import MapTokenType
 from rlftsim.policies.trafficbots.network import AgentConditioning, AgentContext, Windows, history_windows, join_windows
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.types import STEP_S
+
+MAX_ACTION = ((5.0, 1.5), (7.0, 7.0), (6.0, 3.0))
+"""Largest acceleration (m/s²) and yaw rate (rad/s) of vehicles, pedestrians and cyclists."""
+LANE_REACHED_M, EDGE_REACHED_M = 50.0, 10.0
+LANE_REACHED_RAD = math.radians(30.0)
+
+
+def max_action(agent_class: Int64[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
+    """Largest acceleration and yaw rate of each agent."""
+    return torch.tensor(MAX_ACTION, device=agent_class.device)[agent_class]
+
+
+def move(
+    pose: Float[Tensor, "*g 3"],
+    speed: Float[Tensor, "*g"],
+    action: Float[Tensor, "*g 2"],
+    limit: Float[Tensor, "*#g 2"],
+) -> tuple[Float[Tensor, "*g 3"], Float[Tensor, "*g 3"]]:
+    """Pose and motion (speed, acceleration, yaw rate) after 0.1 s.
+
+    Args:
+        pose: Poses before the step.
+        speed: Speeds before the step, negative backwards, m/s.
+        action: Actions before tanh, as the network returns.
+        limit: Largest actions of the agents, from `max_action`.
+    """
+    acceleration, yaw_rate = (limit * action.tanh()).unbind(-1)
+    # Midpoint rule: speed and heading in the middle of the step.
+    distance = (speed + acceleration * (STEP_S / 2)) * STEP_S
+    heading = pose[..., 2]
+    position = pose[..., :2] + distance[..., None] * heading_vector(heading + yaw_rate * (STEP_S / 2))
+    moved = torch.cat([position, (heading + yaw_rate * STEP_S)[..., None]], -1)
+    return moved, torch.stack([speed + acceleration * STEP_S, acceleration, yaw_rate], -1)
+
+
+def reaches_destination(
+    pose: Float[Tensor, "B N A 3"], destination: Int64[Tensor, "B N A"], scene: Scene
+) -> Bool[Tensor, "B N A"]:
+    """True = near a lane and in its direction, or near an edge.
+
+    Args:
+        pose: Poses of the agents, ego frame, m and rad.
+        destination: Map token of each agent's destination, at least 0.
+        scene: Scene with the map.
+    """
+    batch = torch.arange(len(pose), device=pose.device)[:, None, None]
+    nodes, mask = scene.node_pose[batch, destination], scene.node_mask[batch, destination]  # [B, N, A, 20, ...]
+    distance = (nodes[..., :2] - pose[..., None, :2]).norm(dim=-1)
+    is_aligned = (nodes[..., 2] - pose[..., None, 2]).cos() > math.cos(LANE_REACHED_RAD)
+    is_lane = scene.map_type[batch, destination] <= MapTokenType.BIKE_LANE  # [B, N, A]
+
+    def has_node(condition: Tensor) -> Tensor:
+        return (condition & mask).any(-1)
+
+    # Distance and direction need not be those of the same node.
+    lane = has_node(distance < LANE_REACHED_M) & has_node(is_aligned)
+    return torch.where(is_lane, lane, has_node(distance < EDGE_REACHED_M))
+
+
+def leaves_map(pose: Float[Tensor, "B N A 3"], scene: Scene) -> Bool[Tensor, "B N A"]:
+    """True = outside of the map's bounding box.
+
+    Args:
+        pose: Poses of the agents, ego frame, m and rad.
+        scene: Scene with the map; without a map no agent leaves.
+    """
+    x_min, x_max, y_min, y_max = scene.map_box[:, None, None].unbind(-1)
+    x, y = pose[..., 0], pose[..., 1]
+    return (x < x_min) | (x > x_max) | (y < y_min) | (y > y_max)
 
 
 @dataclass(eq=False)
@@ -27,7 +97,7 @@ class Record:
     """Poses before each decision."""
     features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
 
-    def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
+    def add(self, state: "State", features: Float[Tensor, "B 1 N A D"]) -> None:
         """Add the next decision of the recorded rollouts; a first decision begins a new record.
 
         Args:
@@ -40,18 +110,16 @@ class Record:
             self.poses.append(state.traffic.windows.pose[..., -1, :].clone())  # a view would keep the window
             self.features.append(features)
 
-    def find_features(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
+    def find_features(self, states: Sequence["State"]) -> Float[Tensor, "B T N A D"] | None:
         """Features at T decisions; None unless the states are those of the record."""
         if self.draws is None or len(self.poses) != len(states) or not torch.equal(self.draws, states[0].draws):
             return None
-        for pose, state in zip(self.poses, states):
-            if not torch.equal(pose, state.traffic.windows.pose[..., -1, :]):
-                return None
-        return torch.cat(self.features, 1)
+        poses = [state.traffic.windows.pose[..., -1, :] for state in states]
+        return torch.cat(self.features, 1) if all(map(torch.equal, self.poses, poses)) else None
 
 
 @dataclass(frozen=True, eq=False)
-class TrafficBotsContext:
+class Context:
     """Values of a scene that agents do not change."""
 
     scene: Scene
@@ -173,20 +241,20 @@ class Memo:
 
 
 @dataclass(frozen=True, eq=False)
-class TrafficBotsState:
+class State:
     """State of N simulations of each scene."""
 
     traffic: Traffic
     conditioning: AgentConditioning
     draws: Float[Tensor, "B N A 17"]
     """Personality (16 numbers) and index of the destination, -1 where there is none."""
+    continues: Bool[Tensor, "B N A"]
+    """True = the agent moved as decided, so that the noise goes on from this decision; False before the first."""
     num_decisions: int = 0
     poses: Float[Tensor, "B N A 1 3"] | None = None
     """Poses in the frame of the batch."""
-    previous: "TrafficBotsState | None" = None
+    previous: "State | None" = None
     """State before the last decision: the noise of a decision depends on the noise of the decision before."""
     decision: Float[Tensor, "B N A 2"] | None = None
     """The last decision."""
-    continues: Bool[Tensor, "B N A"] | None = None
-    """True = the agent moved as decided, so that the noise goes on from this decision."""
     memo: Memo = field(default_factory=Memo, repr=False)

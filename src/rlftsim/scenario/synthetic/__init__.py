@@ -1,5 +1,11 @@
 """Synthetic scenarios in the shape of WOMD: an embedded pack, and its generator, which runs SUMO as a subprocess."""
 
-from rlftsim.scenario.synthetic.pack import pack_path
+from pathlib import Path
 
-__all__ = ["pack_path"]
+
+def pack_path() -> Path:
+    """Folder of the embedded data set: 200 scenarios, made by `generate` with the arguments in the manifest.
+
+    The splits are "training" and "validation"; `ScenarioDataset` opens the folder.
+    """
+    return Path(__file__).parent / "pack"

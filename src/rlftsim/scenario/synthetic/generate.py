@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
-from rlftsim.jobs.files import remove_temporaries_below, write_text
+from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, find_differences
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner, check_begun, choose_runner
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
+    INDEX,
     MANIFEST,
     SHARDS,
     Manifest,
@@ -26,7 +27,7 @@ from rlftsim.scenario.dataset import (
     read_manifest,
     write_index_and_manifest,
 )
-from rlftsim.scenario.shards import ShardReader, ShardWriter
+from rlftsim.scenario.shards import ShardReader, ShardWriter, check_scenario
 from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_scenarios
 from rlftsim.scenario.synthetic.world import simulate_world
@@ -188,7 +189,8 @@ def generate(
             format=WholeFiles(shards, attrgetter("shard_name"), ShardReader, attrgetter("num_scenarios")),
             show_progress=show_progress,
         )  # fmt: skip
-        remove_temporaries_below(folder)  # of processes that were killed
+        # of processes that were killed
+        remove_temporaries([marker, folder / INDEX, folder / MANIFEST, *paths])
 
         # 3. Index and manifest.
         entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]
@@ -204,5 +206,6 @@ def _write_shard(folder: Path, task: NetworkTask, advance: Advance, is_stopped: 
         return
     with ShardWriter(folder / task.shard_name) as writer:
         for scenario in generate_scenarios(task):
+            check_scenario(scenario)
             writer.add(scenario, task.split)
     advance(task.num_scenarios)

@@ -7,10 +7,10 @@ from jaxtyping import Float
 
 from rlftsim.geometry import boxes_overlap
 from rlftsim.scenario.synthetic.bodies import Body
-from rlftsim.scenario.synthetic.demand import draw_size
 from rlftsim.scenario.synthetic.map_features import resample
 from rlftsim.scenario.synthetic.network import Network
 from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
+from rlftsim.scenario.synthetic.sumo import draw_size
 from rlftsim.scenario.types import ObjectType
 
 CLEAR_AT_JUNCTION_M = 12.0

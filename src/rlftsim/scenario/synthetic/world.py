@@ -5,15 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.scenario.synthetic import sumo
-from rlftsim.scenario.synthetic.city_plan import draw_city_plan
-from rlftsim.scenario.synthetic.crop import MapCropper
-from rlftsim.scenario.synthetic.demand import write_demand
-from rlftsim.scenario.synthetic.freeway_plan import draw_freeway_plan
-from rlftsim.scenario.synthetic.ground import draw_ground
+from rlftsim.scenario.synthetic.bodies import read_pedestrians, read_signals, read_vehicles
+from rlftsim.scenario.synthetic.crop import MapCropper, draw_ground
 from rlftsim.scenario.synthetic.map_features import build_network_map
 from rlftsim.scenario.synthetic.network import read_network
 from rlftsim.scenario.synthetic.parking import park_in_lots, park_in_strips
-from rlftsim.scenario.synthetic.recording import read_pedestrians, read_signals, read_vehicles
+from rlftsim.scenario.synthetic.street_plan import draw_city_plan, draw_freeway_plan
+from rlftsim.scenario.synthetic.sumo import write_demand
 from rlftsim.scenario.synthetic.windows import World
 from rlftsim.scenario.types import STEP_S
 

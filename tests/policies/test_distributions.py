@@ -5,9 +5,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from rlftsim.policies import token_rows
-from rlftsim.policies.distributions import LazyTokenDistribution, TokenDistribution
-from rlftsim.policies.token_rows import TokenRows, compute_row_statistics
+from rlftsim.policies import distributions
+from rlftsim.policies.distributions import LazyTokenDistribution, TokenDistribution, TokenRows, compute_row_statistics
 
 NUM_ROWS, WIDTH, NUM_TOKENS = 70, 6, 40
 
@@ -40,7 +39,7 @@ def chosen(rows):
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     """Several blocks, the last of which is not full."""
-    monkeypatch.setitem(token_rows.ROWS_PER_BLOCK, "cpu", 16)
+    monkeypatch.setitem(distributions.ROWS_PER_BLOCK, "cpu", 16)
 
 
 def inputs(rows):

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from rlftsim.scenario.index_row import classify_ego_maneuver, compute_index_row
+from rlftsim.scenario.maneuver import classify_ego_maneuver
+from rlftsim.scenario.shards import compute_index_row
 from rlftsim.scenario.womd import scenario_from_bytes
 
 
@@ -42,6 +43,11 @@ def test_the_index_row_counts_what_is_there_at_the_current_step(make_message):
     message.tracks[3].states[10].valid = False
     message.tracks[1].object_type = 4
     row = compute_index_row(scenario_from_bytes(message.SerializeToString()), "training")
-    assert (row.scenario_id, row.split, row.num_steps) == ("0a1b", "training", 91)
-    assert (row.num_vehicles, row.num_pedestrians, row.num_cyclists, row.num_others) == (1, 1, 1, 1)
-    assert (row.num_evaluated, row.num_map_features, row.num_map_points, row.num_light_states) == (2, 2, 32, 91)
+    assert (row["scenario_id"], row["split"], row["num_steps"]) == ("0a1b", "training", 91)
+    assert (row["num_vehicles"], row["num_pedestrians"], row["num_cyclists"], row["num_others"]) == (1, 1, 1, 1)
+    assert (row["num_evaluated"], row["num_map_features"], row["num_map_points"], row["num_light_states"]) == (
+        2,
+        2,
+        32,
+        91,
+    )

@@ -1,18 +1,39 @@
-"""Rollouts of files in separate panels, beside those that the studio simulates."""
+"""Models and rollouts of files that a studio is started with; the rollouts get separate panels."""
 
+from collections.abc import Container
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from rlftsim.errors import ConfigError
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
+from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.realism import SimulatedStates
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, is_goal_conditioned
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.studio import Refusal
 from rlftsim.studio.encoding import encode_poses
-from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.scoring import score_states
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A policy under the name that the page shows."""
+
+    name: str
+    source: str
+    """As given on the command line."""
+    policy: Policy
+    fingerprint: str
+    takes_goals: bool
+    note: str
+    """Reason for controls that are switched off; empty where all work."""
+    can_guide: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +64,37 @@ class Imported:
         return SimulatedStates(np.array(ids), *axes)
 
 
+def load_models(names: tuple[str, ...], device: Device) -> list[Model]:
+    """Models by the names that `load_policy` takes, in the same order.
+
+    Args:
+        names: Runs, model folders or registered names; of equal names the second is shown as "name-2".
+        device: Device that the models simulate on.
+
+    Raises:
+        RlftsimError: No such model, or a damaged one.
+    """
+    models: dict[str, Model] = {}
+    for source in names:
+        policy = load_policy(source, device)
+        path = Path(source)
+        # A run's model lies in run/model: the run's name says more.
+        stem = path.resolve().parent.name if path.name == "model" else path.name or path.resolve().name
+        name = _number_name(stem, models)
+        takes_goals = is_goal_conditioned(policy)
+        note = "" if takes_goals else f"{name} is not goal-conditioned: it was not trained to follow goals."
+        models[name] = Model(name, source, policy, fingerprint_policy(policy), takes_goals, note, _can_guide(policy))
+    return list(models.values())
+
+
+def _can_guide(policy: Policy) -> bool:
+    try:
+        with_guidance(policy, 2.0)
+    except ConfigError:
+        return False
+    return True
+
+
 def import_rollouts(sources: tuple[str, ...]) -> dict[str, Imported]:
     """Rollouts of files and folders by name; files are only listed, not read.
 
@@ -51,10 +103,15 @@ def import_rollouts(sources: tuple[str, ...]) -> dict[str, Imported]:
     """
     imported: dict[str, Imported] = {}
     for source in sources:
-        stem = Path(source).resolve().name
-        name = next(n for k in range(1, len(sources) + 1) if (n := stem if k == 1 else f"{stem}-{k}") not in imported)
+        name = _number_name(Path(source).resolve().name, imported)
         imported[name] = Imported(name, {entry.scenario_id: entry for entry in find_rollouts(source)})
     return imported
+
+
+def _number_name(stem: str, taken_names: Container[str]) -> str:
+    """The name itself, or else the first of "name-2", "name-3", ... that is not taken."""
+    numbered = (f"{stem}-{number}" for number in count(2))
+    return next(name for name in chain([stem], numbered) if name not in taken_names)
 
 
 def encode_imported(imported: Imported, scenario: Scenario) -> bytes:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlftsim.scenario.synthetic.gates import (
+from rlftsim.scenario.synthetic.windows import (
     compute_off_road_m,
     compute_overlap_s,
     moves_plausibly,

@@ -8,9 +8,8 @@ import pytest
 
 import scenes
 from rlftsim.errors import DataError
-from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, write_dataset
-from rlftsim.scenario.splits import find_clusters, is_in_exam
-from rlftsim.scenario.synthetic.pack import pack_path
+from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, is_in_exam, write_dataset
+from rlftsim.scenario.synthetic import pack_path
 
 EXAM_LOGS = [8, 9, 13, 15, 19, 21]
 
@@ -24,7 +23,7 @@ def written(folder, ids, source="womd", split="validation"):
 
 def test_synthetic_scenarios_are_of_the_networks_of_their_shards():
     held_out = ScenarioDataset("synthetic", "validation")
-    assert len(held_out) == len(find_clusters(held_out)) == 40
+    assert len(held_out) == len(held_out.clusters) == 40
     assert sorted(set(held_out.clusters)) == ["2026/1/0", "2026/1/1", "2026/1/2", "2026/1/3"]
     assert len(set(ScenarioDataset("synthetic").clusters)) == 20
 

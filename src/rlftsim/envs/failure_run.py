@@ -1,0 +1,200 @@
+"""Runs a study of failures: pilots, then repeats, as items of `jobs` with a file each.
+
+An interrupted study goes on where it was, and a larger budget adds to a smaller one.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimate, Study, StudyConfig, share_budget
+from rlftsim.envs.failures import Failure, Repeat
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.resumable import ScenarioValues
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import remove_temporaries
+from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
+from rlftsim.jobs.items import group_positions, group_task, run_items
+from rlftsim.jobs.processes import Task
+from rlftsim.jobs.runner import Joining, Runner, Share
+
+ABOUT = "failures.json"
+"""Settings of the study in a folder."""
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Repeats of a scenario that run side by side."""
+
+    scenario_id: str
+    number: int
+    is_branching: bool
+
+    @property
+    def name(self) -> str:
+        """Stem of the file."""
+        return f"{self.scenario_id}-{'' if self.is_branching else 'quiet'}{self.number}"
+
+
+def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int], Runner]) -> Study:
+    """Estimates of all scenarios, and `failures.parquet`; only what earlier calls left undone is done.
+
+    Args:
+        config: Planner, traffic, scenarios and event.
+        out: Folder of the study; holds the files of pilots and repeats, too.
+        budget: Steps of all pilots and repeats.
+        runner: Maker of the runner of a number of items; changes no result.
+
+    Raises:
+        ConfigError: A planner that cannot be copied, a budget that is too small, or the folder of another study.
+        DataError: The event holds at the start of every scenario.
+        SetAside, Unfinished: See `run_items`. Shares do the pilot first, and with the same command the repeats.
+    """
+    ids = config.scenario_ids()
+    config.chain(ids[0])  # a planner that cannot be copied ends here
+    check_folder(out, "results")
+    identity = config.identity()
+    differences = find_differences(out / ABOUT, identity, "name another --out")
+    if differences:
+        raise ConfigError(f"{out} holds failures of another {', '.join(differences)}: name another --out.")
+    write_identity(out / ABOUT, identity)
+    # 1. the pilot
+    all_pilots: list[Pilot] = _measure(
+        f"pilot of {config.planner}",
+        ScenarioValues(out / "pilot", ids, _agree(ids, identity), _read_pilot),
+        partial(_drive_pilot, config, ids),
+        runner(len(ids)),
+    )
+    pilots = [pilot for pilot in all_pilots if not pilot.problem]
+    if not pilots:
+        raise DataError(all_pilots[0].problem)
+    # 2. the repeats
+    plan = share_budget(pilots, config.particles, budget)
+    items = [
+        _Round(pilot.scenario_id, number, is_branching)
+        for pilot, (count, is_branching) in zip(pilots, plan) for number in range(1, count + 1)
+    ]  # fmt: skip
+    names = [item.name for item in items]
+    rounds: list[tuple[Repeat, ...]] = _measure(
+        f"failures of {config.planner}",
+        ScenarioValues(out / "repeats", names, _agree(names, identity), _read_round),
+        partial(_drive_round, config, items),
+        _show_estimate(runner(len(items)), out / "repeats"),
+    )
+    repeats: dict[str, list[Repeat]] = {pilot.scenario_id: [] for pilot in pilots}
+    for item, finished in zip(items, rounds):
+        repeats[item.scenario_id].extend(finished)
+    estimates = [ScenarioEstimate(tuple(repeats[p.scenario_id]), config.particles, p) for p in pilots]
+    problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
+    study = Study(config, tuple(estimates), problems)
+    study.write(out / FAILURES)
+    remove_temporaries([out / ABOUT, out / FAILURES])  # of processes that were killed
+    return study
+
+
+def _agree(names: Sequence[str], identity: Mapping[str, Any]) -> dict[str, Mapping[str, object]]:
+    """Values that the file of each item must agree with."""
+    return {name: {"study": identity} for name in names}
+
+
+def _measure(
+    title: str, format: ScenarioValues[Any], work: Callable[[int], Mapping[str, object]], runner: Runner
+) -> list[Any]:
+    """Values of all items, from their files, which stay."""
+    groups = group_positions(len(format.scenario_ids), 1)
+    with Lease(format.folder / ".lock", runner, "works in") as lease:
+        values = run_items(title, groups, group_task(work, format), format=format, lease=lease, runner=runner)
+        remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
+        lease.remove()
+    return values
+
+
+def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict[str, object]:
+    episodes = config.chain(ids[position])
+    try:
+        episodes.check_start()
+        paths, danger = episodes.start(np.arange(config.pilot))
+    except DataError as error:  # also a planner that fails
+        return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
+    driven_m = float(np.mean([path.driven_m for path in paths]))
+    return asdict(
+        Pilot(ids[position], tuple(danger.max(1).tolist()), driven_m, sum(len(path.motion) for path in paths))
+    )
+
+
+def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
+    pilot = _build(Pilot, values)
+    if pilot.scenario_id != name:
+        raise ValueError("of another scenario")
+    return pilot
+
+
+def _drive_round(config: StudyConfig, items: Sequence[_Round], position: int) -> dict[str, object]:
+    item = items[position]
+    episodes = config.chain(item.scenario_id, item.number)
+    repeats = episodes.estimate(config.particles, REPEATS, is_branching=item.is_branching)
+    return {"probability": float(np.mean([r.probability for r in repeats])), "repeats": [asdict(r) for r in repeats]}
+
+
+def _read_round(name: str, values: Mapping[str, Any]) -> tuple[Repeat, ...]:
+    repeats = tuple(
+        _build(Repeat, {**repeat, "failures": tuple(_build(Failure, failure) for failure in repeat["failures"])})
+        for repeat in values["repeats"]
+    )
+    if len(repeats) != REPEATS:
+        raise ValueError("some repeats are missing")
+    return repeats
+
+
+def _build(cls: type[Value], values: Mapping[str, Any]) -> Value:
+    """Dataclass of values of a file, of which others are left out.
+
+    Raises:
+        KeyError, TypeError, ValueError: The file was cut or edited.
+    """
+    try:
+        return cls(**{field.name: values[field.name] for field in fields(cls)})  # type: ignore[arg-type]
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+
+
+def _show_estimate(runner: Runner, folder: Path) -> Runner:
+    """The same runner, whose progress shows the present estimate."""
+    if isinstance(runner, Share):
+        return replace(runner, runner=_Telling(runner.runner, folder))
+    return runner if isinstance(runner, Joining) else _Telling(runner, folder)
+
+
+@dataclass(frozen=True)
+class _Telling:
+    """A runner that shows the present estimate, from the files of finished repeats, beside the progress."""
+
+    runner: Runner
+    folder: Path
+    _probability: dict[str, float] = field(default_factory=dict)
+
+    def run(self, task: Task, items: Sequence[Any], *, advance: Any, describe: Callable[[Any], str] = str) -> list[Any]:
+        """Results of all items, see `Runner`."""
+
+        def tell(count: int = 1, note: str = "") -> None:
+            advance(count, note or self._describe())
+
+        return self.runner.run(task, items, advance=tell, describe=describe)
+
+    def _describe(self) -> str:
+        """Mean over the scenarios with a repeat."""
+        for path in self.folder.glob("*.json"):
+            if path.stem not in self._probability:
+                try:
+                    self._probability[path.stem] = float(read_json(path, "measure it again")["probability"])
+                except (DataError, OSError, KeyError, TypeError, ValueError):
+                    continue  # a damaged file is made again
+        of_scenario: dict[str, list[float]] = {}
+        for name, probability in self._probability.items():
+            of_scenario.setdefault(name.rpartition("-")[0], []).append(probability)
+        return f"P so far {np.mean([np.mean(p) for p in of_scenario.values()]):.2g}" if of_scenario else ""

@@ -1,0 +1,148 @@
+"""`rlftsim runs`: training runs side by side, with the settings in which they differ."""
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from rlftsim.errors import DataError, in_short
+from rlftsim.jobs.folder import recognize_folder
+from rlftsim.jobs.progress import print_wide
+from rlftsim.training.run_folder import RUN_INPUTS, flatten, may_change, read_metrics, stored_settings
+
+VALIDATION = "validation_rmm"
+MEASURES = (VALIDATION, "rmm", "loss", "imitation_loss")
+"""Metrics that say how good a model is, the most telling first; losses are better where they are lower."""
+NO_VALUE = "–"
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """A run of any training method, finished or not."""
+
+    folder: Path
+    settings: Mapping[str, Any]
+    """Settings by dotted name, and hashes of the inputs; without those that change no result."""
+    metrics: Sequence[Mapping[str, Any]]
+    """Metrics of each update, as in metrics.jsonl."""
+    is_finished: bool
+
+    @property
+    def num_updates(self) -> int:
+        """Number of updates done."""
+        return int(self.metrics[-1]["update"]) if self.metrics else 0
+
+    @property
+    def measure(self) -> str | None:
+        """The most telling metric that the run has logged; None before the first update."""
+        logged = {name for values in self.metrics for name in values}
+        return next((name for name in MEASURES if name in logged), None)
+
+    @property
+    def last(self) -> float | None:
+        """Last value of the measure; of a metric of training batches, which are small, the mean of the last tenth."""
+        values = [value for _, value in self._read_measure()]
+        recent = values[-1:] if self.measure == VALIDATION else values[-math.ceil(len(values) / 10) :]
+        return sum(recent) / len(recent) if recent else None
+
+    @property
+    def best(self) -> tuple[int, float] | None:
+        """Update with the best validation, and its value. The best of many training batches would be luck."""
+        values = self._read_measure() if self.measure == VALIDATION else []
+        return max(values, key=lambda pair: pair[1], default=None)
+
+    def _read_measure(self) -> list[tuple[int, float]]:
+        name = self.measure
+        return [(int(line["update"]), float(line[name])) for line in self.metrics if name is not None and name in line]
+
+
+def runs(folders: list[str]) -> list[TrainingRun]:
+    """List training runs: how far they are, how good, and which settings differ.
+
+    Example: `rlftsim runs runs/*`
+
+    The metric is the RMM of validation where a run has validated; else the RMM of its training rollouts or the loss,
+    whose mean over the last tenth of the updates is "last". Values of different data do not compare.
+
+    Args:
+        folders: Folders of runs; other files and folders are passed over, if there is a run among them.
+
+    Raises:
+        DataError: No run, or no such folder.
+        CheckpointError: A file of settings is damaged.
+    """
+    paths = [Path(folder) for folder in folders]
+    missing = [path for path in paths if not path.exists()]
+    if missing:
+        raise DataError(f"{missing[0]} does not exist: name folders of training runs, such as runs/*.")
+    listed = [read_run(path) for path in paths if recognize_folder(path) == "run"]
+    if not listed:
+        raise DataError(f"no training run in {in_short(', '.join(map(str, paths)))}: name the --out of a training.")
+    return listed
+
+
+def read_run(folder: Path) -> TrainingRun:
+    """The run in a folder.
+
+    Raises:
+        CheckpointError: The file of settings is damaged.
+    """
+    stored = stored_settings(folder)
+    settings = {name: value for name, value in flatten(stored).items() if not may_change(name)}
+    settings |= {name: stored[name][:8] for name in RUN_INPUTS if isinstance(stored.get(name), str)}
+    return TrainingRun(folder, settings, read_metrics(folder), (folder / "model" / "config.json").exists())
+
+
+def find_differences(training_runs: Sequence[TrainingRun]) -> dict[str, list[str]]:
+    """Settings in which runs differ, by name: the value of each run as text.
+
+    Args:
+        training_runs: Runs of any methods; a setting that a run does not have is no difference, and "–" there.
+    """
+    rows: dict[str, list[str]] = {}
+    for name in dict.fromkeys(name for run in training_runs for name in run.settings):
+        values = [_format(run.settings[name]) if name in run.settings else NO_VALUE for run in training_runs]
+        if len(set(values) - {NO_VALUE}) > 1:
+            rows[name] = values
+    return rows
+
+
+def print_runs(training_runs: list[TrainingRun]) -> None:
+    """Print a table of runs, and one of the settings in which they differ.
+
+    Args:
+        training_runs: Runs, in the order of the rows.
+    """
+    names = _shorten_names([run.folder for run in training_runs])
+    table = Table()
+    for heading in ("run", "state", "updates", "metric", "last", "best", "at update"):
+        table.add_column(heading, justify="left" if heading in ("run", "state", "metric") else "right", overflow="fold")
+    for name, run in zip(names, training_runs):
+        update, best = run.best or (NO_VALUE, None)
+        state = "finished" if run.is_finished else "not finished"
+        measure = run.measure or NO_VALUE
+        table.add_row(name, state, str(run.num_updates), measure, _format(run.last), _format(best), str(update))
+    differences = Table("setting", *names)
+    for name, values in find_differences(training_runs).items():
+        differences.add_row(name, *values)
+    print_wide(table, *([differences] if differences.row_count else []))
+
+
+def _shorten_names(folders: Sequence[Path]) -> list[str]:
+    """Paths without the folder that all of them are in."""
+    if len(folders) < 2:
+        return [str(folder) for folder in folders]
+    shared = os.path.commonpath([folder.absolute().parent for folder in folders])
+    return [os.path.relpath(folder.absolute(), shared) for folder in folders]
+
+
+def _format(value: Any) -> str:
+    """A setting or a metric as text."""
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return NO_VALUE if value is None else value if isinstance(value, str) else json.dumps(value)
