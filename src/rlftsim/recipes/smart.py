@@ -3,6 +3,7 @@ changes fields."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 
@@ -120,6 +121,10 @@ def smart_demo_rlftsim() -> SmartRecipe:
     # Few scenarios mean few updates, so steps are larger than the paper's; all agents are trained on. Averaged weights
     # and standing tokens that count less save three of ten passes. With credit by agent traffic stays nearer to the log
     # than with the paper's at the same realism, and without the last two settings of fine-tuning it gets much slower.
+    near_log: dict[str, Any] = dict(
+        epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
+        checkpoint_every=20,
+    )  # fmt: skip
     return SmartRecipe(
         tokens=TokensConfig(num_tokens=1024, num_map_prototypes=256),
         model=smart_demo(),
@@ -132,14 +137,8 @@ def smart_demo_rlftsim() -> SmartRecipe:
             checkpoint_every=20, kl=KlConfig(target=0.02, initial_beta=0.01), goals=GoalConfig(learning_rate_scale=5.0),
             credit="agent", imitation_weight=0.002, hold_speed=True,
         ),
-        catk=CatkConfig(
-            epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
-            checkpoint_every=20,
-        ),
-        road=RoadConfig(
-            epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
-            checkpoint_every=20,
-        ),
+        catk=CatkConfig(**near_log),
+        road=RoadConfig(**near_log),
         gcsl=GcslConfig(
             epochs=1.0, batch_size=1, num_rollouts=4, warmup_updates=10, max_trained_agents=None, checkpoint_every=80,
         ),

@@ -200,11 +200,13 @@ class CalibrationLearner(Learner):
         gradients = self.statistics.gradients.numpy()
         table = []
         for index, name in enumerate(self.config.features):
-            parts = {
+            gains_by_score = {
                 score: float(step[index] * gradients[:, position, index].mean())
                 for position, score in enumerate(("rmm", *SUB_SCORES))
             }
-            table.append({"feature": name, "eta": float(eta[index]), "t": t_value(gradients[:, 0, index]), **parts})
+            table.append(
+                {"feature": name, "eta": float(eta[index]), "t": t_value(gradients[:, 0, index]), **gains_by_score}
+            )
         changes = []
         for row, (tried, kl) in enumerate(zip(self.config.lengths, kls[1:]), 1):
             changes.append({"length": tried, "kl": float(kl - kls[0])})

@@ -1,6 +1,5 @@
 """CAT-K rollouts and RoaD rollouts: simulations that stay near the log, with a target for each decision."""
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -66,8 +65,8 @@ def roll_out_closest(
     # The log in steps of one token, 0.5 s: poses and validity, [B, A, tokens].
     tokens = tokenize_agents(batch, policy.vocabulary, catk_compat=catk_compat)
     decision_targets: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]
-    logged = _targets(batch, tokens, policy.vocabulary, catk_compat)
-    take = _CHOICES[choice]
+    # `simulate` decides in the order of time.
+    steps = iter(range(HISTORY_TOKENS, tokens.logged_valid.shape[-1]))
     # K numbers for each decision of an agent in place of one, as independent of the batch as those of `simulate`
     num_draws = num_candidates if choice == "sampled" else 0
     num_decisions = tokens.logged_valid.shape[-1] - HISTORY_TOKENS
@@ -77,11 +76,11 @@ def roll_out_closest(
     def choose(
         distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Tensor
     ) -> Int64[Tensor, "B N A"]:
-        # `simulate` decides in the order of time, so the next target is that of this decision.
-        target = next(logged)((state.position, state.heading))
+        pose = state.position, state.heading
+        target = _find_target(batch, tokens, next(steps), pose, policy.vocabulary, catk_compat)
         if choice == "sampled":
             noise = next(draw)
-        decision = take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
+        decision = _CHOICES[choice](distribution, target, num_candidates, noise)  # type: ignore[arg-type]
         best = decision if targets == "taken" else target.best_token()
         decision_targets.append((best, target.logged_valid & target.is_near_log(max_distance_lengths)))
         return decision
@@ -140,26 +139,19 @@ class _Target:
         return (catk_compat.place_boxes(ends, *pose) - boxes[:, None]).norm(dim=-1).mean(-1)
 
 
-def _targets(
-    batch: ScenarioBatch, tokens: AgentTokens, vocabulary: Vocabulary, catk_compat: bool
-) -> Iterator[Callable[[Pose], _Target]]:
-    """Yield for each decision the function from the simulation's poses to targets."""
-    for step in range(HISTORY_TOKENS, tokens.logged_valid.shape[-1]):
+def _find_target(
+    batch: ScenarioBatch, tokens: AgentTokens, step: int, pose: Pose, vocabulary: Vocabulary, catk_compat: bool
+) -> _Target:
+    """Target of a decision, which leads from the token before `step` to that at `step`; `pose` is the simulation's."""
 
-        def make_target(pose: Pose, step: int = step) -> _Target:
-            def at(values: Tensor, step: int) -> Tensor:
-                values = values[:, None, :, step]  # the log is the same for all N rollouts
-                return values.expand(-1, pose[1].shape[1], *values.shape[2:])
+    def at(values: Tensor, step: int) -> Tensor:
+        values = values[:, None, :, step]  # the log is the same for all N rollouts
+        return values.expand(-1, pose[1].shape[1], *values.shape[2:])
 
-            # The decision leads from the token before `step` to that at `step`.
-            start, end = ((at(tokens.logged_position, k), at(tokens.logged_heading, k)) for k in (step - 1, step))
-            class_id = class_of_type(batch.object_type)[:, None].expand(pose[1].shape)
-            return _Target(
-                pose, start, at(tokens.logged_valid, step - 1), end, at(tokens.logged_valid, step), class_id,
-                vocabulary, catk_compat,
-            )  # fmt: skip
-
-        yield make_target
+    start, end = ((at(tokens.logged_position, k), at(tokens.logged_heading, k)) for k in (step - 1, step))
+    start_valid, end_valid = at(tokens.logged_valid, step - 1), at(tokens.logged_valid, step)
+    class_id = class_of_type(batch.object_type)[:, None].expand(pose[1].shape)
+    return _Target(pose, start, start_valid, end, end_valid, class_id, vocabulary, catk_compat)
 
 
 def _take_closest(distribution: TokenLogits, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:

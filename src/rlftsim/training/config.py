@@ -64,20 +64,20 @@ def complete_reward(text: str) -> tuple[str, bool]:
     return write_reward(terms), bool(goal_terms(terms))
 
 
-def _check_up_to_1(config: object, group: str = "", **kinds: str) -> None:
+def _check_up_to_1(config: object, group: str = "", **words: str) -> None:
     """Check that fields of a configuration are in [0, 1].
 
     Args:
         config: Settings with the fields.
         group: Beginning of their names in the message, such as "goals.".
-        kinds: Words for each field, such as "a probability", by its name.
+        words: Words for each field, such as "a probability", by its name.
 
     Raises:
         ConfigError: A field is not; the message names it and its value.
     """
-    for name, kind in kinds.items():
+    for name, word in words.items():
         if not 0 <= getattr(config, name) <= 1:
-            raise ConfigError(f"{group}{name} is {kind} in [0, 1], got {getattr(config, name)}.")
+            raise ConfigError(f"{group}{name} is {word} in [0, 1], got {getattr(config, name)}.")
 
 
 def _check_betas(betas: tuple[float, float]) -> None:
