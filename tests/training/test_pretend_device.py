@@ -26,7 +26,7 @@ from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
-from rlftsim.training import finetune, processes
+from rlftsim.training import processes, reward
 from rlftsim.training.catk_rollouts import roll_out_closest
 from rlftsim.training.config import GoalConfig, ValidationConfig
 from rlftsim.training.run_folder import read_metrics
@@ -271,7 +271,7 @@ def test_counts_of_larger_pieces_are_bounded(vocabulary, batch):
     """Whatever the number of rollouts; each bound is some percent above what was counted."""
     config = replace(tiny.FINETUNE, num_rollouts=4)
     with on_device() as device:
-        learner = finetune.prepare(tiny.tiny_policy(vocabulary, smart_demo()), config, DEVICE)
+        learner = reward.prepare(tiny.tiny_policy(vocabulary, smart_demo()), config, DEVICE)
         policy, batch = learner.policy, batch.to(DEVICE)
         with torch.no_grad():
             context = policy.encode(batch)
@@ -284,9 +284,9 @@ def test_counts_of_larger_pieces_are_bounded(vocabulary, batch):
             score_batch(batch.scenarios, states)
         assert_below(counts, launches=1_350, waits=10, copies=10)
         with device.count() as counts:
-            finetune.update_policy(learner, batch, config, PretendFabric())
+            reward.update_policy(learner, batch, config, PretendFabric())
         assert_below(counts, launches=20_000, waits=60, copies=115)
-        finetune.update_policy(learner, batch, replace(config, hold_speed=True), PretendFabric())
+        reward.update_policy(learner, batch, replace(config, hold_speed=True), PretendFabric())
 
 
 def assert_below(counts, launches, waits, copies):

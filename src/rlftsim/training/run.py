@@ -258,7 +258,7 @@ class TrainingRun:
             stop.args = (f"continues behind update {parse_update(newest)}" if newest else "starts anew",)
             raise
 
-    def keep_best(self, values: Mapping[str, float]) -> None:
+    def keep_best(self, values: Mapping[str, Any]) -> None:
         """Keep the weights if this is the best validation so far.
 
         Args:
@@ -267,7 +267,7 @@ class TrainingRun:
         if self._choose_best({**values, "update": self.learner.update}) and self.fabric.is_global_zero:
             self.folder.write_best(self.learner.update, self.learner.result)
 
-    def _choose_best(self, values: Mapping[str, float]) -> bool:
+    def _choose_best(self, values: Mapping[str, Any]) -> bool:
         """Compare a validation with the best so far; True if it is better."""
         bound = values.get("validation_gain_low", math.nan)
         if math.isfinite(bound) and (self._best is None or bound > self._best[0]):

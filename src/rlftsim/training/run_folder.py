@@ -210,11 +210,18 @@ class RunFolder:
         Args:
             update: Number of updates behind which they were validated.
             model: Module that gets the weights.
+
+        Raises:
+            CheckpointError: Damaged file, or weights of a different module.
         """
+        path = self._best(update)
         try:
-            weights, _ = read_tensors(self._best(update), "train again", error=CheckpointError)
+            weights, _ = read_tensors(path, "remove it and train again", error=CheckpointError)
+            _check_weights(path.stem, weights, model)
         except FileNotFoundError:
             return False
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {error}: remove it and train again.") from None
         model.load_state_dict(weights)
         return True
 
