@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
-from rlftsim.verbs.commands import FLAG, list_flags
+from rlftsim.cli.signatures import FLAG, list_flags
 
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
 

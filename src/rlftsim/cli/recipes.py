@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 
+from rlftsim.cli.signatures import Call, list_flags, read_arguments
 from rlftsim.recipes.base import SECTIONS
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.verbs.commands import Call, Command, list_flags, read_arguments
+from rlftsim.verbs.commands import Command
 from rlftsim.verbs.recipe_flags import DEFAULT_RECIPE, RecipeFlags, check_no_settings, find_value
 
 

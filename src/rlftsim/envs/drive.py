@@ -35,10 +35,11 @@ from rlftsim.evaluation.resumable import (
     ScenarioValues,
     check_same_work,
     check_scenarios_stay,
-    finish_result,
+    claim_result,
     read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
+from rlftsim.jobs.items import group_positions, group_task, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.dataset import dataset_folder
@@ -218,21 +219,17 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    return finish_result(
-        f"{config.planner} in {settings.traffic}",
-        ids,
-        partial(_drive_scenario, config, settings.traffic, ids),
-        path=path,
-        format=ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing),
-        find=partial(_read_finished, config, settings, ids, path),
-        combine=partial(_combine, settings),
-        runner=choose_runner(config.jobs, len(ids)),
-    )
-
-
-def _combine(settings: DriveSettings, rows: Sequence[tuple[dict[str, Any], dict[str, str]]]) -> DriveResult:
-    """Result of the rows of all scenarios and the scores that each cannot give."""
-    return DriveResult.of(settings, [row for row, _ in rows], {row["scenario_id"]: missing for row, missing in rows})
+    format = ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
+    runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
+    with claim_result(path, format, ids, find, runner) as claim:
+        if claim.lease is not None:
+            title = f"{config.planner} in {settings.traffic}"
+            groups, task = group_positions(len(ids), 1), partial(_drive_scenario, config, settings.traffic, ids)
+            rows = run_items(title, groups, group_task(task, format), format=format, lease=claim.lease, runner=runner)
+            missing = {row["scenario_id"]: reasons for row, reasons in rows}
+            claim.result = DriveResult.of(settings, [row for row, _ in rows], missing)
+    assert claim.result is not None
+    return claim.result
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:

@@ -20,9 +20,7 @@ from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_
 from rlftsim.jobs.files import remove_folder, write_text
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
-from rlftsim.jobs.processes import Advance
-from rlftsim.jobs.runner import Runner, choose_runner
-from rlftsim.realism import metric_by_name
+from rlftsim.jobs.runner import Advance, Runner, choose_runner
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
 from rlftsim.viewer.chart import Chart, Curve, chart_html
@@ -134,7 +132,7 @@ def _write_page(
     html = ""
     # Without road edges there is no score to explain; scoring says so.
     if scenario is not None and (config.missing_map == "error" or has_road_edge(scenario)):
-        html = explanation_html(explain(scenario, read_states(entry), metric_by_name(config.metric)))
+        html = explanation_html(explain(scenario, read_states(entry), config.official_metric))
     write_text(folder / name, html)
     advance(1)
 

@@ -14,6 +14,7 @@ from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_line, print_wide
+from rlftsim.rollout.policy import Policy, is_goal_conditioned
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.open import check_membership
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
@@ -191,6 +192,51 @@ def warn_of_doubts(entries: Sequence[GoalEntry], scenario: Scenario) -> None:
     for entry in entries:
         for line in goal_warnings(entry, scenario):
             log.info(f"  {line}")
+
+
+def check_goal_effects(goals: GoalsFile, policy: Policy, name: str, guidance_scale: float) -> None:
+    """Check that goals and guidance have an effect.
+
+    Args:
+        goals: Goals of the simulated agents; may be empty.
+        policy: Policy that simulates.
+        name: Name of the policy, for messages.
+        guidance_scale: Factor on the goal-progress bias; 1 = as learned.
+
+    Raises:
+        ConfigError: Goals of a policy that is not goal-conditioned, or guidance without goals.
+    """
+    if goals.goals and not is_goal_conditioned(policy):
+        raise ConfigError(
+            f"{name} is not goal-conditioned, {len(goals.goals)} goals would have no effect: take a model "
+            "that was fine-tuned with goals (docs/goals.md), or leave --goal and --goals out."
+        )
+    if guidance_scale != 1.0 and not goals.goals:
+        raise ConfigError(f"--guidance-scale {guidance_scale:g} has no effect without goals: add --goal or --goals.")
+
+
+def check_scenarios(
+    scenario_ids: Sequence[str], goals: GoalsFile, dataset: ScenarioDataset, name: str, are_given: bool
+) -> None:
+    """Check scenarios and goals that are to be simulated, and log what is doubtful about them.
+
+    Args:
+        scenario_ids: Ids of the scenarios.
+        goals: Goals of their agents; may be empty.
+        dataset: Data set that must have the scenarios.
+        name: Name of the data set, for messages.
+        are_given: True where the ids were given by `--scenario`, else they are those of goals.
+
+    Raises:
+        DataError: An unknown scenario, or an impossible goal.
+    """
+    for scenario_id in scenario_ids:
+        entries = goals.of_scenario(scenario_id)
+        check_membership(dataset, scenario_id, name, "--scenario" if are_given else next(iter(entries), ""))
+        if entries:
+            warn_of_doubts(entries, dataset.by_id(scenario_id))
+        elif goals.goals:
+            log.info(f"  scenario {scenario_id} has no goals: it is simulated without.")
 
 
 def _add_rows(

@@ -1,6 +1,8 @@
 """Data sets and policies by name, and the forms in which verbs take scenarios and policies."""
 
+import inspect
 import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -144,3 +146,20 @@ def check_config(config: object, section: str, *classes: type) -> None:
         raise ConfigError(
             f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."
         )
+
+
+def check_left_out(verb: Callable[..., Any], values: Mapping[str, Any], names: Sequence[str], reason: str) -> None:
+    """Check that arguments without effect have their defaults.
+
+    Args:
+        verb: Function with the defaults.
+        values: Values by argument.
+        names: Arguments without effect.
+        reason: Rest of the message, behind the argument.
+
+    Raises:
+        ConfigError: An argument has another value.
+    """
+    for name in names:
+        if values[name] != inspect.signature(verb).parameters[name].default:
+            raise ConfigError(f"{name} {reason}")

@@ -11,13 +11,14 @@ import numpy as np
 from rich.table import Table
 
 from rlftsim.errors import DataError
-from rlftsim.evaluation.evaluate import EvaluateConfig, frozen_copy, simulate_states
+from rlftsim.evaluation.evaluate import EvaluateConfig, simulate_states
 from rlftsim.evaluation.resumable import ScenarioRows
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import scenario_log, score
-from rlftsim.rollout.policy import get_device
+from rlftsim.rollout.policy import frozen_copy, get_device
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.messages import encode_rollouts
@@ -68,7 +69,7 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
         for position in [chosen[0], *chosen]:
             start = time.process_time()
             scenario = dataset[position]
-            states = simulate_states(policy, scenario, config, get_device(policy))
+            states = simulate_states(policy, collate([scenario]).to(get_device(policy)), config)
             if plan == "submit":
                 encode_rollouts(scenario.scenario_id, states)
             else:
