@@ -152,15 +152,16 @@ def _check_values(values: Mapping[str, Any], words: Sequence[str]) -> None:
         if value in ([], ()) and flag in words:
             raise ConfigError(f"{flag} needs at least one value.")
         if isinstance(value, Path) and ADDRESS.match(str(value)):
-            _explain_address(value, words)
+            _explain_address(name, value, words)
         if is_dataclass(value):
             _check_values(vars(value), words)
 
 
-def _explain_address(path: Path, words: Sequence[str]) -> None:
+def _explain_address(argument: str, path: Path, words: Sequence[str]) -> None:
     """Refuse an address of a bucket in place of a path, with the commands that bring the result there.
 
     Args:
+        argument: Name of the argument; only the destination of a data set has such commands.
         path: Path that was made of the address.
         words: Words of the whole command.
 
@@ -168,7 +169,7 @@ def _explain_address(path: Path, words: Sequence[str]) -> None:
         ConfigError: Always.
     """
     address = next((word for word in words if "://" in word and Path(word) == path), str(path))
-    if words[0] not in ("convert", "synthesize"):
+    if argument != "destination":
         raise ConfigError(
             f"{address} is an address: name a folder or a file of this machine here, and copy it by the bucket's own "
             "tools (docs/machines.md)."

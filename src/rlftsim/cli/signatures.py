@@ -86,10 +86,7 @@ class Argument:
         if is_dataclass(self.default):
             return self.default
         choices = get_args(self.annotation) or (self.annotation,)
-        return next(
-            (cls() for cls in choices if isinstance(cls, type) and is_dataclass(cls)),
-            None,
-        )
+        return next((cls() for cls in choices if isinstance(cls, type) and is_dataclass(cls)), None)
 
     def to_parameter(self, *markers: Any) -> inspect.Parameter:
         """The argument as tyro reads it, its text on one line; settings become the flags of their fields.

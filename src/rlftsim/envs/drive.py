@@ -37,9 +37,9 @@ from rlftsim.evaluation.resumable import (
     check_scenarios_stay,
     claim_result,
     read_finished,
+    run_groups,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.items import group_positions, group_task, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.dataset import dataset_folder
@@ -223,9 +223,8 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
     with claim_result(path, format, ids, find, runner) as claim:
         if claim.lease is not None:
-            title = f"{config.planner} in {settings.traffic}"
-            groups, task = group_positions(len(ids), 1), partial(_drive_scenario, config, settings.traffic, ids)
-            rows = run_items(title, groups, group_task(task, format), format=format, lease=claim.lease, runner=runner)
+            work = partial(_drive_scenario, config, settings.traffic, ids)
+            rows = run_groups(f"{config.planner} in {settings.traffic}", ids, work, format, claim.lease, runner)
             missing = {row["scenario_id"]: reasons for row, reasons in rows}
             claim.result = DriveResult.of(settings, [row for row, _ in rows], missing)
     assert claim.result is not None

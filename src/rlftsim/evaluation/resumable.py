@@ -213,12 +213,36 @@ def measure_scenarios(
         NotYetError: A second process at work in the folder.
         SetAside: See `run_items`.
     """
-    groups = group_positions(len(format.scenario_ids), format.items_per_file)
-    runner, task = choose_runner(jobs, len(groups)), group_task(work, format)
+    runner = choose_runner(jobs, len(format.scenario_ids))
     with Lease(format.folder / ".lock", runner, "works in") as lease:
-        stored = run_items(title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress)
+        stored = run_groups(title, format.scenario_ids, work, format, lease, runner, show_progress=show_progress)
         lease.remove()
     return stored
+
+
+def run_groups(
+    title: str,
+    scenario_ids: Sequence[str],
+    work: Callable[[int], Result],
+    format: ScenarioFormat[Stored, Result],
+    lease: Lease,
+    runner: Runner,
+    *,
+    show_progress: bool = True,
+) -> list[Stored]:
+    """Stored results of the groups of scenarios, done now where they are missing, see `run_items`.
+
+    Args:
+        title: Name of the work, in front of the progress bar.
+        scenario_ids: Ids of all scenarios, in the order of the groups.
+        work: Function from the position of a scenario to the result of the scenario.
+        format: Files of the groups.
+        lease: Lock on their folder.
+        runner: Runner of the groups that are missing; changes no result.
+        show_progress: False prints neither progress nor the time left.
+    """
+    groups, task = group_positions(len(scenario_ids), format.items_per_file), group_task(work, format)
+    return run_items(title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress)
 
 
 @runtime_checkable

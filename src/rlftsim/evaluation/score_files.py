@@ -19,11 +19,10 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation, run_groups
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
-from rlftsim.jobs.items import group_positions, group_task, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
@@ -121,17 +120,13 @@ def score_rollouts(
         guessed=source.guessed,
     )
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
-    groups, ids = group_positions(len(entries), ScenarioRows.items_per_file), [entry.scenario_id for entry in entries]
-    runner = runner or choose_runner(config.num_jobs, len(groups))
+    ids, work = [entry.scenario_id for entry in entries], partial(_score_entry, entries, source, config, num_rollouts)
+    runner = runner or choose_runner(config.num_jobs, math.ceil(len(entries) / ScenarioRows.items_per_file))
     with claim_evaluation(name, provenance, out, ids, runner) as (rows, claim):
         if claim.lease is not None:
-            task = group_task(partial(_score_entry, tuple(entries), source, config, num_rollouts), rows)
             claim.result = rows.join(
-                run_items(
-                    f"score {name}", groups, task,
-                    format=rows, lease=claim.lease, runner=runner, show_progress=show_progress,
-                )
-            )  # fmt: skip
+                run_groups(f"score {name}", ids, work, rows, claim.lease, runner, show_progress=show_progress)
+            )
     assert claim.result is not None
     # The result may be a stored one, made under missing_map="skip".
     _check_maps(claim.result.skipped, config)

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import torch
+from rich.table import Table
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import SCHEMA, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.rollout_files import AXES
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest
-from rlftsim.evaluation.score_files import has_road_edge
+from rlftsim.evaluation.score_files import format_scores, has_road_edge
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.policies.checkpoint import read_card
@@ -242,8 +243,8 @@ class ArchiveScores:
         result = score(scenario_log(scenario), states, self._metric)
         self._rows.append(row_of_result(result, scenario, states))
 
-    def evaluation(self, check: ArchiveCheck, sample: float) -> Evaluation:
-        """The scores, in the order of the archive.
+    def table(self, check: ArchiveCheck, sample: float) -> Table:
+        """Every mean score, for `print_wide`.
 
         Args:
             check: Finished check of the archive.
@@ -269,4 +270,4 @@ class ArchiveScores:
             guessed=data.guessed,
         )
         table = pa.Table.from_pylist(self._rows, schema=SCHEMA)
-        return Evaluation(check.archive, provenance, table, tuple(self._skipped))
+        return format_scores(Evaluation(check.archive, provenance, table, tuple(self._skipped)))

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from rlftsim.errors import ConfigError, shorten
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
-from rlftsim.evaluation.score_files import format_scores
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
@@ -157,7 +156,7 @@ def check(
     if json is not None:
         write_findings(result, json)
     if scores is not None:
-        print_wide(format_scores(scores.evaluation(result, sample)))
+        print_wide(scores.table(result, sample))
     return int(result.findings.has_errors)
 
 

@@ -129,8 +129,5 @@ def _format_misses(start: Row, row: Row) -> str:
 
 
 EXPERIMENT = Experiment(
-    "Do goal-conditioned agents follow their goals, and what does it cost in realism?",
-    run,
-    summarize,
-    needs_goals=True,
+    "Do goal-conditioned agents follow their goals, and what does it cost in realism?", run, summarize, needs_goals=True
 )
