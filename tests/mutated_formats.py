@@ -24,12 +24,12 @@ from av2_files import write_av2
 from rlftsim.cli.main import main, parse
 from rlftsim.envs import EgoEnv
 from rlftsim.errors import RlftsimError
-from rlftsim.evaluation.calibration_picture import write_calibration_picture
 from rlftsim.evaluation.drive_results import DriveResult
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.evaluation.goal_attainment import attain_goals
+from rlftsim.evaluation.learning_curve import write_calibration_picture
 from rlftsim.evaluation.reward_variance import measure_variances
-from rlftsim.experiments.ledger import Ledger
+from rlftsim.experiments.exam import Ledger
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_file
 from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
@@ -582,7 +582,7 @@ FORMATS: Mapping[str, Format] = {
         {"exam.jsonl": "json"},
         make_ledger,
         lambda folder: Ledger(folder / "exam.jsonl").count_looks("e", "r", ["f" * 32], is_repeat=True),
-        ("experiments.ledger",),
+        ("experiments.exam",),
     ),
     "goals": Format(
         {"goals.json": "json"},

@@ -16,15 +16,15 @@ from rlftsim import __version__
 from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
-from rlftsim.verbs.commands import COMMANDS, GROUPS, VERBS
+from rlftsim.verbs.commands import COMMANDS, VERBS
 
 JOIN = "join"
-OVERVIEW = "\n\n".join(
+OVERVIEW = "\n".join(
     [
-        f"rlftsim {__version__}: traffic agents that behave like real road users.",
-        "usage: rlftsim VERB ...      rlftsim VERB --help explains a verb",
-        *("\n".join(f"  {name:12} {verb.summary}" for name, verb in group.items()) for group in GROUPS),
-        f"  {JOIN} VERB .. put the shares of a command together that ran on several machines (--share K/N)\n",
+        f"rlftsim {__version__}: traffic agents that behave like real road users.\n",
+        "usage: rlftsim VERB ...      rlftsim VERB --help explains a verb\n",
+        *("\n" * verb.begins_group + f"  {name:12} {verb.summary}" for name, verb in VERBS.items()),
+        f"\n  {JOIN} VERB .. put the shares of a command together that ran on several machines (--share K/N)\n",
     ]
 )
 SIGNALLED = 128
@@ -85,8 +85,8 @@ def parse(words: Sequence[str]) -> Any:
         SystemExit: They ask for help, which has been printed.
     """
     if words[0] not in (*VERBS, JOIN):
-        near = difflib.get_close_matches(words[0], [*VERBS, JOIN], 1)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(VERBS)}."
+        matches = difflib.get_close_matches(words[0], [*VERBS, JOIN], 1)
+        hint = f"did you mean {matches[0]}?" if matches else f"known are {', '.join(VERBS)}."
         raise ConfigError(f"no verb {in_short(words[0])}: {hint}")
     for word in words:
         try:
@@ -111,8 +111,8 @@ def _in_words(error: Exception) -> str | None:
     """One line about what the machine lacks; None for any other error."""
     # Libraries wrap a full disk in errors of their own, so the text decides, not the class.
     if getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error):
-        where = getattr(error, "filename", None)
-        return f"the disk is full{f', writing {where}' if where else ''}: free some space and repeat the command."
+        filename = getattr(error, "filename", None)
+        return f"the disk is full{f', writing {filename}' if filename else ''}: free some space and repeat the command."
     # By name: torch is not imported for this.
     if type(error).__name__ == "OutOfMemoryError":
         return (

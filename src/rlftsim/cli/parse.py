@@ -109,8 +109,8 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
     # Warnings on the way, such as that of a reward that is registered twice, are shown after all.
     if complaint.getvalue():
         log.warning(complaint.getvalue().rstrip())
-    own = {argument: value for argument, value in call.values.items() if argument not in command.sections}
-    _check_values(own, [*name.split(), *words])
+    flag_values = {argument: value for argument, value in call.values.items() if argument not in command.sections}
+    _check_values(flag_values, [*name.split(), *words])
     return finish_call(call, flags, list_flags(words)) if flags else call
 
 
@@ -125,14 +125,14 @@ def _help_text(read: Any) -> str:
 @contextmanager
 def _wide() -> Iterator[None]:
     """Let tyro write lines as long as they are: each message stands on one line of its box."""
-    before = os.environ.get("COLUMNS")
+    columns = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
         yield
     finally:
         del os.environ["COLUMNS"]
-        if before is not None:
-            os.environ["COLUMNS"] = before
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def _check_values(values: Mapping[str, Any], words: Sequence[str]) -> None:

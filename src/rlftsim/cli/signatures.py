@@ -64,7 +64,7 @@ def _to_parameter(command: Command, argument: "Argument") -> inspect.Parameter:
     """An argument of a command as tyro reads it."""
     name, label = argument.name, command.names.get(argument.name)
     if name in command.required:
-        argument = Argument(name, without_none(argument.annotation), NO_DEFAULT, argument.text)
+        argument = Argument(name, to_required_type(argument.annotation), NO_DEFAULT, argument.text)
     if name in command.positional:
         return argument.to_parameter(tyro.conf.Positional, tyro.conf.arg(metavar=label or name.upper()))
     # flags of shared settings stand among those of the verb
@@ -169,7 +169,7 @@ def list_flags(words: Sequence[str]) -> list[str]:
     return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
 
 
-def without_none(annotation: Any) -> Any:
+def to_required_type(annotation: Any) -> Any:
     """A type without None, which nobody gives where a value is required."""
     choices = [cls for cls in get_args(annotation) if cls is not types.NoneType]
     return Union[tuple(choices)] if get_origin(annotation) in (Union, types.UnionType) else annotation  # noqa: UP007

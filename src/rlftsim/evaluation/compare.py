@@ -73,8 +73,8 @@ class PairedDifference:
         direction = find_direction(self.column)
         if direction == "log":  # neither more nor less is better
             return f"difference: {numbers}."
-        is_better = (self.difference > 0) == (direction == "higher")
-        return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
+        is_gain = (self.difference > 0) == (direction == "higher")
+        return f"difference, for the {'better' if is_gain else 'worse'}: {numbers}."
 
     @property
     def cells(self) -> tuple[str, ...]:

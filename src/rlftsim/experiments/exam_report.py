@@ -9,8 +9,7 @@ from typing import Any
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, find_direction
 from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
 from rlftsim.experiments import tables
-from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Margin
-from rlftsim.experiments.ledger import Ledger
+from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Ledger, Margin
 from rlftsim.experiments.results import format_origin, to_finite
 from rlftsim.experiments.tables import TextTable
 from rlftsim.jobs.files import write_text

@@ -59,148 +59,140 @@ class Verb:
     """What the actions do in all, of a verb that has actions alone."""
     starts_anew: bool = False
     """True if nothing of an interrupted run is kept."""
+    begins_group: bool = False
+    """True for a verb behind an empty line of the overview."""
 
 
 FOLDER, MODEL, DATA = {"destination": "FOLDER"}, {"policy": "MODEL"}, {"scenarios": "data"}
 FINETUNING = ("finetune", "catk", "road", "gcsl", "calibrate")
-GROUPS = (
-    {
-        "demo": Verb("run the whole pipeline on synthetic scenarios, in minutes, on a CPU", Command("demo:demo")),
-        "doctor": Verb(
-            "check this machine and print what to do about each problem",
-            Command("doctor:doctor"), starts_anew=True,
-        ),
-        "plugins": Verb(
-            "list what other installed packages add, and why one fails",
-            Command("plugins:plugins"), starts_anew=True,
-        ),
-    },
-    {
-        "convert": Verb(
-            "convert logged scenarios, such as WOMD tfrecords, to a portable data set",
-            Command("convert:convert", ("source", "destination"), names={**FOLDER, "reader": "from"}, has_shares=True),
-        ),
-        "data": Verb(
-            "check a data set, or print its statistics",
-            {
-                "verify": Command("data:verify", ("data",)),
-                "stats": Command("data:stats", ("data",)),
-                "push": Command("data:push", ("folder", "url")),
-                "pull": Command("data:pull", ("url", "folder")),
-            },
-            "Check a data set for damage, print its statistics, or copy it to a bucket and back.",
-            starts_anew=True,
-        ),
-        "synthesize": Verb(
-            "make synthetic scenarios with SUMO",
-            Command("synthesize:synthesize", ("destination",), names=FOLDER, has_shares=True),
-        ),
-    },
-    {
-        "recipe": Verb(
-            "list the recipes (models and training settings), or print one",
-            Command("recipe:recipe", ("name",), show="print_recipe"), starts_anew=True,
-        ),
-        "tokens": Verb(
-            "build a vocabulary of motion and map tokens, or measure its coverage",
-            Command("tokens:tokens", sections=("tokens",)), starts_anew=True,
-        ),
-        "pretrain": Verb(
-            "train a model on logged tracks",
-            Command("pretrain:pretrain", ("policy",), ("out",), {"policy": "RECIPE", "scenarios": "data"},
-                "print_model", ("model", "pretrain"), recipe="policy", hidden=("held_out",)),
-        ),
-        "finetune": Verb(
-            "fine-tune a model in closed loop with a realism reward, also with goals",
-            Command("finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
-                "print_model", FINETUNING),
-        ),
-        "runs": Verb(
-            "list training runs: how far they are, how good, and which settings differ",
-            Command("runs:runs", ("folders",), show="print_runs"), starts_anew=True,
-        ),
-        "augment": Verb(
-            "sample further goals for goal-conditioned fine-tuning",
-            Command("augment:augment", ("model",), has_shares=True),
-        ),
-        "models": Verb(
-            "list the models in the box and those of other packages",
-            Command("model:list_models"), starts_anew=True,
-        ),
-        "model": Verb(
-            "average models; import a checkpoint of the public CAT-K code, or export one",
-            {
-                "show": Command("model:show_model", ("model",)),
-                "average": Command("model:average_models", ("models",)),
-                "import": Command("model:import_model", ("checkpoint",), names={"format": "from"}),
-                "export": Command("model:export_model", ("model", "out"), names={"format": "to"}),
-            },
-            "Show or average models, import a checkpoint of the public CAT-K code, or export a model to it.",
-            starts_anew=True,
-        ),
-        "goals": Verb(
-            "propose goals for agents and write a goals file, or check one",
-            {
-                "propose": Command("goals:propose_goals", ("data",)),
-                "check": Command("goals:check_goals", ("file",)),
-            },
-            "Propose goals for agents, or check a file of them.",
-            starts_anew=True,
-        ),
-        "simulate": Verb(
-            "roll out scenarios with a model",
-            Command("simulate:simulate", ("policy",), ("out",), {**MODEL, **DATA}, "print_rollouts", has_shares=True),
-        ),
-        "drive": Verb(
-            "let a planner drive among simulated traffic, and score both",
-            Command("drive:drive", ("planner",)),
-        ),
-        "failures": Verb(
-            "estimate how often a planner fails in realistic traffic, and show how",
-            {
-                "": Command("failures:failures", ("planner",), has_shares=True),
-                "show": Command("failures:show_failure", ("folder", "number")),
-            },
-        ),
-        "studio": Verb(
-            "ask agents for things in the browser, and look at what happens",
-            Command("studio:studio"), starts_anew=True,
-        ),
-    },
-    {
-        "score": Verb(
-            "score rollouts of any simulator with the official realism meta-metric",
-            Command("score:score", ("rollouts",), show="print_scores", has_shares=True),
-        ),
-        "evaluate": Verb(
-            "evaluate a model with the official realism meta-metric",
-            Command("evaluate:evaluate", ("policy",), ("out",), MODEL, "print_evaluation", has_shares=True),
-        ),
-        "compare": Verb(
-            "compare two evaluations scenario by scenario",
-            Command("compare:compare", ("a", "b"), names={"a": "FIRST", "b": "SECOND"}, show="print_comparison"),
-            starts_anew=True,
-        ),
-        "submit": Verb(
-            "build an archive for the Sim Agents leaderboard, or check one before it is uploaded",
-            {
-                "build": Command("submit:build", ("model",), has_shares=True),
-                "check": Command("submit:check", ("archive",)),
-                "info": Command("submit:info", ("archive",)),
-            },
-            "Build, check or describe an archive for the Sim Agents challenge (docs/submission.md).",
-        ),
-        "experiment": Verb(
-            "repeat an experiment of the paper: a table, verdicts and a figure; or sit the exam",
-            {
-                "": Command("experiment:experiment", ("name",), sections=("tokens", "model", "pretrain", *FINETUNING)),
-                "exam": Command("exam:exam"),
-            },
-        ),
-    },
-)  # fmt: skip
-"""Verbs in the order in which a newcomer needs them, in the groups of the overview."""
-VERBS = {name: verb for group in GROUPS for name, verb in group.items()}
+VERBS = {
+    "demo": Verb("run the whole pipeline on synthetic scenarios, in minutes, on a CPU", Command("demo:demo")),
+    "doctor": Verb(
+        "check this machine and print what to do about each problem",
+        Command("doctor:doctor"), starts_anew=True,
+    ),
+    "plugins": Verb(
+        "list what other installed packages add, and why one fails",
+        Command("plugins:plugins"), starts_anew=True,
+    ),
+    "convert": Verb(
+        "convert logged scenarios, such as WOMD tfrecords, to a portable data set",
+        Command("convert:convert", ("source", "destination"), names={**FOLDER, "reader": "from"}, has_shares=True),
+        begins_group=True,
+    ),
+    "data": Verb(
+        "check a data set, or print its statistics",
+        {
+            "verify": Command("data:verify", ("data",)),
+            "stats": Command("data:stats", ("data",)),
+            "push": Command("data:push", ("folder", "url")),
+            "pull": Command("data:pull", ("url", "folder")),
+        },
+        "Check a data set for damage, print its statistics, or copy it to a bucket and back.",
+        starts_anew=True,
+    ),
+    "synthesize": Verb(
+        "make synthetic scenarios with SUMO",
+        Command("synthesize:synthesize", ("destination",), names=FOLDER, has_shares=True),
+    ),
+    "recipe": Verb(
+        "list the recipes (models and training settings), or print one",
+        Command("recipe:recipe", ("name",), show="print_recipe"), starts_anew=True, begins_group=True,
+    ),
+    "tokens": Verb(
+        "build a vocabulary of motion and map tokens, or measure its coverage",
+        Command("tokens:tokens", sections=("tokens",)), starts_anew=True,
+    ),
+    "pretrain": Verb(
+        "train a model on logged tracks",
+        Command("pretrain:pretrain", ("policy",), ("out",), {"policy": "RECIPE", "scenarios": "data"},
+            "print_model", ("model", "pretrain"), recipe="policy", hidden=("held_out",)),
+    ),
+    "finetune": Verb(
+        "fine-tune a model in closed loop with a realism reward, also with goals",
+        Command("finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
+            "print_model", FINETUNING),
+    ),
+    "runs": Verb(
+        "list training runs: how far they are, how good, and which settings differ",
+        Command("runs:runs", ("folders",), show="print_runs"), starts_anew=True,
+    ),
+    "augment": Verb(
+        "sample further goals for goal-conditioned fine-tuning",
+        Command("augment:augment", ("model",), has_shares=True),
+    ),
+    "models": Verb(
+        "list the models in the box and those of other packages",
+        Command("model:list_models"), starts_anew=True,
+    ),
+    "model": Verb(
+        "average models; import a checkpoint of the public CAT-K code, or export one",
+        {
+            "show": Command("model:show_model", ("model",)),
+            "average": Command("model:average_models", ("models",)),
+            "import": Command("model:import_model", ("checkpoint",), names={"format": "from"}),
+            "export": Command("model:export_model", ("model", "out"), names={"format": "to"}),
+        },
+        "Show or average models, import a checkpoint of the public CAT-K code, or export a model to it.",
+        starts_anew=True,
+    ),
+    "goals": Verb(
+        "propose goals for agents and write a goals file, or check one",
+        {
+            "propose": Command("goals:propose_goals", ("data",)),
+            "check": Command("goals:check_goals", ("file",)),
+        },
+        "Propose goals for agents, or check a file of them.",
+        starts_anew=True,
+    ),
+    "simulate": Verb(
+        "roll out scenarios with a model",
+        Command("simulate:simulate", ("policy",), ("out",), {**MODEL, **DATA}, "print_rollouts", has_shares=True),
+    ),
+    "drive": Verb("let a planner drive among simulated traffic, and score both", Command("drive:drive", ("planner",))),
+    "failures": Verb(
+        "estimate how often a planner fails in realistic traffic, and show how",
+        {
+            "": Command("failures:failures", ("planner",), has_shares=True),
+            "show": Command("failures:show_failure", ("folder", "number")),
+        },
+    ),
+    "studio": Verb(
+        "ask agents for things in the browser, and look at what happens",
+        Command("studio:studio"), starts_anew=True,
+    ),
+    "score": Verb(
+        "score rollouts of any simulator with the official realism meta-metric",
+        Command("score:score", ("rollouts",), show="print_scores", has_shares=True),
+        begins_group=True,
+    ),
+    "evaluate": Verb(
+        "evaluate a model with the official realism meta-metric",
+        Command("evaluate:evaluate", ("policy",), ("out",), MODEL, "print_evaluation", has_shares=True),
+    ),
+    "compare": Verb(
+        "compare two evaluations scenario by scenario",
+        Command("compare:compare", ("a", "b"), names={"a": "FIRST", "b": "SECOND"}, show="print_comparison"),
+        starts_anew=True,
+    ),
+    "submit": Verb(
+        "build an archive for the Sim Agents leaderboard, or check one before it is uploaded",
+        {
+            "build": Command("submit:build", ("model",), has_shares=True),
+            "check": Command("submit:check", ("archive",)),
+            "info": Command("submit:info", ("archive",)),
+        },
+        "Build, check or describe an archive for the Sim Agents challenge (docs/submission.md).",
+    ),
+    "experiment": Verb(
+        "repeat an experiment of the paper: a table, verdicts and a figure; or sit the exam",
+        {
+            "": Command("experiment:experiment", ("name",), sections=("tokens", "model", "pretrain", *FINETUNING)),
+            "exam": Command("exam:exam"),
+        },
+    ),
+}  # fmt: skip
+"""Verbs in the order in which a newcomer needs them."""
 COMMANDS = {
     f"{name} {action}".strip(): command
     for name, verb in VERBS.items()

@@ -117,10 +117,10 @@ def _find_tracks(scenario: Scenario, object_ids: list[int] | None) -> list[int]:
     if object_ids is None:
         return scenario.evaluated_indices.tolist()
     track_by_id = {int(scenario.tracks.object_id[track]): int(track) for track in scenario.simulated_indices}
-    unknown = [str(object_id) for object_id in object_ids if object_id not in track_by_id]
-    if unknown:
+    unknown_ids = [str(object_id) for object_id in object_ids if object_id not in track_by_id]
+    if unknown_ids:
         raise ConfigError(
-            f"no agent {', '.join(unknown)} in scenario {scenario.scenario_id}: there are "
+            f"no agent {', '.join(unknown_ids)} in scenario {scenario.scenario_id}: there are "
             f"{', '.join(map(str, sorted(track_by_id)))}."
         )
     return [track_by_id[object_id] for object_id in dict.fromkeys(object_ids)]
@@ -216,7 +216,7 @@ def check_goal_effects(goals: GoalsFile, policy: Policy, name: str, guidance_sca
 
 
 def check_scenarios(
-    scenario_ids: Sequence[str], goals: GoalsFile, dataset: ScenarioDataset, name: str, are_given: bool
+    scenario_ids: Sequence[str], goals: GoalsFile, dataset: ScenarioDataset, name: str, has_scenario_flag: bool
 ) -> None:
     """Check scenarios and goals that are to be simulated, and log what is doubtful about them.
 
@@ -225,14 +225,14 @@ def check_scenarios(
         goals: Goals of their agents; may be empty.
         dataset: Data set that must have the scenarios.
         name: Name of the data set, for messages.
-        are_given: True where the ids were given by `--scenario`, else they are those of goals.
+        has_scenario_flag: True where the ids are those of `--scenario`, else they are those of goals.
 
     Raises:
         DataError: An unknown scenario, or an impossible goal.
     """
     for scenario_id in scenario_ids:
         entries = goals.of_scenario(scenario_id)
-        check_membership(dataset, scenario_id, name, "--scenario" if are_given else next(iter(entries), ""))
+        check_membership(dataset, scenario_id, name, "--scenario" if has_scenario_flag else next(iter(entries), ""))
         if entries:
             warn_of_doubts(entries, dataset.by_id(scenario_id))
         elif goals.goals:

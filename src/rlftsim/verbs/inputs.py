@@ -141,8 +141,8 @@ def check_config(config: object, section: str, *classes: type) -> None:
         ConfigError: Settings of no such kind.
     """
     if not isinstance(config, (*classes, type(None))):
-        *most, last = (settings_class.__name__ for settings_class in classes)
-        names = f"{', '.join(most)} or {last}" if most else last
+        *class_names, last_name = (settings_class.__name__ for settings_class in classes)
+        names = f"{', '.join(class_names)} or {last_name}" if class_names else last_name
         raise ConfigError(
             f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."
         )
