@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rlftsim.policies.calibrated.policy import CALIBRATION
-from rlftsim.policies.calibrated.table import read_calibration
+from rlftsim.policies.calibrated.policy import CALIBRATION, read_calibration
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.viewer.chart import Chart, Curve
 from rlftsim.viewer.figure import charts_to_png
