@@ -28,7 +28,7 @@ RATES = (1e-3, 1e-1)
 """Rates of the scenarios that are compared with brute force."""
 
 
-def kept(path: Path, make) -> dict:
+def load_or_make(path: Path, make) -> dict:
     """Values of a JSON file, made now where it is missing."""
     if not path.exists():
         write_text(path, json.dumps(make()))
@@ -46,7 +46,7 @@ def count_events(config: StudyConfig, scenario_id: str, episodes: int, out: Path
             steps = sum(len(path.motion) for path in paths)
             return {"events": sum(bool((path.danger >= 0).any()) for path in paths), "steps": steps}
 
-        values = kept(out / f"{config.planner}-{scenario_id}-{first:05d}.json", drive)
+        values = load_or_make(out / f"{config.planner}-{scenario_id}-{first:05d}.json", drive)
         total, steps = total + values["events"], steps + values["steps"]
     return total, steps
 
@@ -77,7 +77,7 @@ def compare_with_brute_force(out: Path, quick: bool) -> None:
             low = stats.beta.ppf(0.025, events, episodes - events + 1) if events else 0.0
             high = stats.beta.ppf(0.975, events + 1, episodes - events)
             results = [
-                kept(
+                load_or_make(
                     out / "split" / f"{planner}-{scenario_id}-{repeat}.json",
                     partial(split, config, scenario_id, repeat),
                 )

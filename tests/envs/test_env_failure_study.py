@@ -29,7 +29,7 @@ def pilot(danger, name="a"):
 
 def estimate(*probabilities, name="a"):
     repeats = tuple(Repeat(probability, 1, 1000, ()) for probability in probabilities)
-    return ScenarioEstimate(pilot([-1.0] * 4, name), 16, repeats)
+    return ScenarioEstimate(repeats, 16, pilot([-1.0] * 4, name))
 
 
 def test_a_budget_is_a_duration_of_a_core_or_a_number_of_steps():

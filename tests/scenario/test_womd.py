@@ -240,6 +240,10 @@ def spoil_tracks(m):
     m.ClearField("tracks")
 
 
+def spoil_stop_point(m):
+    m.dynamic_map_states[2].lane_states[0].stop_point.y = float("inf")
+
+
 def spoil_lane_far_out(m):
     m.map_features[0].lane.polyline[0].x = 1e30
 
@@ -251,6 +255,7 @@ BAD = [
     (spoil_heading, "track 101 has a NaN or infinite heading at step 17"),
     (spoil_size, "track 101 has a NaN or infinite size at step 17"),
     (spoil_map, r"map feature 8 has a NaN or infinite point \(its point 1\)"),
+    (spoil_stop_point, r"stop point \d+ of the traffic lights is NaN or infinite"),
     (spoil_polygon, r"map feature 9 has a NaN or infinite point \(its point 2\)"),
     (spoil_ego, "no ego: sdc_track_index is 3, but there are 3 tracks"),
     (spoil_negative_ego, "no ego: sdc_track_index is -1"),

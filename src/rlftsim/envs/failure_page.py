@@ -15,7 +15,7 @@ from rlftsim.envs.dangers import StepView
 from rlftsim.envs.drivers import Driver
 from rlftsim.envs.episode import Episode, EpisodeState
 from rlftsim.envs.failure_study import ScenarioEstimate, Study, StudyConfig
-from rlftsim.envs.failures import DrivenPath, Failure, FailureChain, choose_failures, count_monte_carlo
+from rlftsim.envs.failures import DrivenPath, Failure, FailureChain, choose_failures
 from rlftsim.envs.record import Record
 from rlftsim.envs.result import build_animation
 from rlftsim.jobs.files import write_text
@@ -180,7 +180,7 @@ def _cells(estimate: ScenarioEstimate) -> tuple[str, ...]:
     contacts = sorted({failure.contact for failure in failures if failure.contact})
     weights = np.array([failure.probability for failure in failures])
     at_fault = weights[[failure.at_fault for failure in failures]].sum() / weights.sum() if failures else 0.0
-    episodes = count_monte_carlo(estimate.probability, estimate.estimates)
+    episodes = estimate.num_monte_carlo
     if not estimate.probability:
         interval = f"< {high:.2g}"
     else:

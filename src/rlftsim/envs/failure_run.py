@@ -6,7 +6,6 @@ An interrupted study goes on where it was, and a larger budget adds to a smaller
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -87,14 +86,10 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         partial(_drive_round, config, items),
         _show_estimate(runner(len(items)), out / "repeats"),
     )
-    estimates = [
-        ScenarioEstimate(
-            pilot,
-            config.particles,
-            tuple(chain.from_iterable(r for item, r in zip(items, rounds) if item.scenario_id == pilot.scenario_id)),
-        )
-        for pilot in pilots
-    ]
+    repeats: dict[str, list[Repeat]] = {pilot.scenario_id: [] for pilot in pilots}
+    for item, finished in zip(items, rounds):
+        repeats[item.scenario_id].extend(finished)
+    estimates = [ScenarioEstimate(tuple(repeats[p.scenario_id]), config.particles, p) for p in pilots]
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
     study = Study(config, tuple(estimates), problems)
     study.write(out / FAILURES)

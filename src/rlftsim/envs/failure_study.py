@@ -20,15 +20,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float
 from scipy import stats
 
 import rlftsim
 from rlftsim.envs.dangers import EVENTS, find_event
-from rlftsim.envs.failures import Failure, FailureChain, Repeat, make_source
+from rlftsim.envs.failures import Failure, FailureChain, RepeatedEstimate, make_source
 from rlftsim.envs.planners.registry import Planner, hash_code, load_planner
 from rlftsim.envs.source import Source
-from rlftsim.envs.splitting import KILLED, estimate_interval
+from rlftsim.envs.splitting import KILLED
 from rlftsim.errors import ConfigError, DataError, check_types, in_short, whole_number
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.documents import first_line, parse_json
@@ -165,35 +164,11 @@ class Pilot:
         return float(np.clip(0.5 * math.exp(max(upper[0] / scale, -700)), LEAST_PROBABILITY, 1 / len(danger)))
 
 
-@dataclass(frozen=True)
-class ScenarioEstimate:
-    """Probability of the event in a scenario, by independent repeats."""
+@dataclass(frozen=True, eq=False)
+class ScenarioEstimate(RepeatedEstimate):
+    """Probability of the event in a scenario of a study."""
 
     pilot: Pilot
-    particles: int
-    repeats: tuple[Repeat, ...]
-
-    @property
-    def estimates(self) -> Float[np.ndarray, "R"]:
-        """Of the repeats."""
-        return np.array([repeat.probability for repeat in self.repeats])
-
-    @property
-    def probability(self) -> float:
-        """Mean of the repeats."""
-        return float(self.estimates.mean())
-
-    @property
-    def variance(self) -> float:
-        """Of the mean; NaN for a single repeat with an event."""
-        if not self.probability:
-            return 0.0
-        return float(self.estimates.var(ddof=1)) / len(self.repeats) if len(self.repeats) > 1 else math.nan
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval, see `splitting.estimate_interval`."""
-        return estimate_interval(self.estimates, self.particles * len(self.repeats))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ class FailureChain:
         first_number: Number of the first dice; those of other chains of the same seed should be far away.
 
     Raises:
-        ConfigError: A planner that cannot be copied.
+        ConfigError: A planner that cannot be copied, or an episode shorter than a block.
     """
 
     def __init__(
@@ -129,6 +129,8 @@ class FailureChain:
         per_decision = source.policy.steps_per_decision if source.policy is not None else 1
         self.block_steps = math.lcm(BLOCK_STEPS, per_decision, source.controls.steps)
         self.num_blocks = source.config.max_steps // self.block_steps
+        if not self.num_blocks:
+            raise ConfigError(f"max_steps is {source.config.max_steps}: give at least {self.block_steps}, a block.")
 
     def start(self, numbers: Int64[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
         """Undisturbed episodes, see `Chain`."""
@@ -179,13 +181,15 @@ class FailureChain:
         size = 1 << (count - 1).bit_length()
         rows = np.resize(np.arange(count), size)  # those beyond `count` are run and not kept
         shared = np.zeros(size, np.int64) if blocks is None else blocks[rows]
-        given = [None] * size if parents is None else [parents[int(row)] for row in rows]
+        parent_paths = [None] * size if parents is None else [parents[int(row)] for row in rows]
         episode, dice = self._episode(size), dice[rows]
         state = start(episode, self._dice(dice[:, 0]))
         danger = np.full((size, 1 + self.num_blocks * self.block_steps), np.nan)
         planners = [self.planner] * size
-        copies: list[list[Planner]] = [list(path.planners[: k + 1]) if path else [] for path, k in zip(given, shared)]
-        for row, (path, k) in enumerate(zip(given, shared)):
+        copies: list[list[Planner]] = [
+            list(path.planners[: k + 1]) if path else [] for path, k in zip(parent_paths, shared)
+        ]
+        for row, (path, k) in enumerate(zip(parent_paths, shared)):
             if path is None:
                 danger[row, 0] = self.event.danger(StepView(episode, state, row))
             else:
@@ -208,7 +212,7 @@ class FailureChain:
                 copies[row].append(copy_planner(planners[row]))
             imposed = np.full((size, self.block_steps, 5), np.nan)
             for row in np.flatnonzero(shared > block):
-                imposed[row] = given[row].motion[steps]  # type: ignore[union-attr]
+                imposed[row] = parent_paths[row].motion[steps]  # type: ignore[union-attr]
             # 2. the steps
             action = np.zeros((size, *self.source.controls.limits.shape))
             for step in range(0, self.block_steps, episode.controls.steps):
@@ -334,13 +338,12 @@ def copy_planner(planner: Planner) -> Planner:
 
 
 @dataclass(frozen=True, eq=False)
-class FailureEstimate:
-    """Probability that an event happens to a planner in a scenario within 8 seconds."""
+class RepeatedEstimate:
+    """Probability of an event in a scenario, by independent repeats."""
 
-    scenario_id: str
     repeats: tuple[Repeat, ...]
     particles: int
-    chain: FailureChain
+    """Undisturbed episodes that each repeat began with."""
 
     @property
     def estimates(self) -> Float[np.ndarray, "R"]:
@@ -352,21 +355,36 @@ class FailureEstimate:
         """Mean of the estimates."""
         return float(self.estimates.mean())
 
-    @cached_property
+    @property
+    def variance(self) -> float:
+        """Of the mean; NaN for a single repeat with an event."""
+        if not self.probability:
+            return 0.0
+        return float(self.estimates.var(ddof=1)) / len(self.repeats) if len(self.repeats) > 1 else math.nan
+
+    @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval; NaN for a single repeat with an event."""
+        """95 % interval, see `splitting.estimate_interval`; NaN for a single repeat with an event."""
         return estimate_interval(self.estimates, self.particles * len(self.repeats))
+
+    @property
+    def num_monte_carlo(self) -> float:
+        """Undisturbed episodes that would give the same standard error; NaN where there is none."""
+        return self.probability * (1 - self.probability) / self.variance if self.variance else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class FailureEstimate(RepeatedEstimate):
+    """Probability that an event happens to a planner in a scenario within 8 seconds."""
+
+    scenario_id: str
+    chain: FailureChain
 
     @property
     def failures(self) -> tuple[Failure, ...]:
         """Episodes in which the event happens; those that stand for most come first."""
         failures = (failure for repeat in self.repeats for failure in repeat.failures)
         return tuple(sorted(failures, key=lambda failure: -failure.probability))
-
-    @property
-    def num_monte_carlo(self) -> float:
-        """Undisturbed episodes that would give as narrow an interval; NaN without one."""
-        return count_monte_carlo(self.probability, self.estimates)
 
     def run_again(self, failure: Failure) -> Result:
         """The episode of a failure, bit for bit, see `FailureChain.run_again`."""
@@ -402,17 +420,6 @@ class FailureEstimate:
             f"P = {self.probability:.2g} [{low:.2g}, {high:.2g}] within 8 s, {len(self.failures)} failing episodes; as "
             f"good as {self.num_monte_carlo:.0f} episodes of Monte Carlo"
         )
-
-
-def count_monte_carlo(probability: float, estimates: Float[np.ndarray, "R"]) -> float:
-    """Undisturbed episodes that would give the same standard error of a probability; NaN where there is none.
-
-    Args:
-        probability: Probability of the event.
-        estimates: Independent estimates whose mean has the standard error.
-    """
-    variance = float(estimates.var(ddof=1)) / len(estimates) if len(estimates) > 1 else 0.0
-    return probability * (1 - probability) / variance if variance else math.nan
 
 
 def choose_failures(failures: Sequence[Failure], limit: int) -> list[Failure]:
@@ -473,9 +480,9 @@ def estimate_failures(
     """
     for name, number, least in (("particles", particles, 2), ("repeats", repeats, 1), ("seed", seed, 0)):
         whole_number(name, number, least)
-    found_event = find_event(event)
     driver = to_planner(planner)
+    measured_event = find_event(event)
     source = make_source(driver, scenario, policy, **settings)
-    chain = FailureChain(source, driver, scenario.scenario_id, found_event, seed=seed)
+    chain = FailureChain(source, driver, scenario.scenario_id, measured_event, seed=seed)
     chain.check_start()
-    return FailureEstimate(scenario.scenario_id, chain.estimate(particles, repeats), particles, chain)
+    return FailureEstimate(chain.estimate(particles, repeats), particles, scenario.scenario_id, chain)

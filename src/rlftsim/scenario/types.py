@@ -343,10 +343,10 @@ class Scenario:
             )
 
     def check_finite_arrays(self) -> None:
-        """Check that every valid state and every map point is finite.
+        """Check that every valid state, map point and stop point is finite.
 
         Raises:
-            DataError: A NaN or an infinite number; the message names track, step and field, or map feature and point.
+            DataError: A NaN or an infinite number; the message names track, step and field, or the point.
         """
         tracks = self.tracks
         for name in ("position", "heading", "velocity", "size"):
@@ -367,6 +367,11 @@ class Scenario:
             raise DataError(
                 f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {index}): "
                 "correct it or leave the feature out"
+            )
+        entries = np.flatnonzero(~np.isfinite(self.lights.stop_point).all(-1))
+        if len(entries):
+            raise DataError(
+                f"stop point {entries[0]} of the traffic lights is NaN or infinite: correct it or leave the light out"
             )
 
     def check_precision(self) -> None:
