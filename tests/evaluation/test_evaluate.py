@@ -158,26 +158,26 @@ def test_an_evaluation_comes_back_from_its_file(data, tmp_path):
 
 def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeypatch):
     whole = evaluate(Wobble(), data, tmp_path, CONFIG, name="whole")
-    original, seen = module._evaluate_scenario, []
+    original, seen = module.scenario_log, []
 
-    def interrupt_at_the_sixth(*work):
+    def interrupt_at_the_sixth(scenario, device):
         if len(seen) == 5:
             raise KeyboardInterrupt
-        seen.append(work[-1])
-        return original(*work)
+        seen.append(scenario.scenario_id)
+        return original(scenario, device)
 
-    monkeypatch.setattr(module, "_evaluate_scenario", interrupt_at_the_sixth)
+    monkeypatch.setattr(module, "scenario_log", interrupt_at_the_sixth)
     with pytest.raises(KeyboardInterrupt):
         evaluate(Wobble(), data, tmp_path, CONFIG, name="cut")
     assert not (tmp_path / "cut.parquet").exists()
     assert len(list((tmp_path / "cut.parts").glob("*.parquet"))) == 1
     rest = []
 
-    def note(policy, dataset, config, position):
-        rest.append(dataset.scenario_ids[position])
-        return original(policy, dataset, config, position)
+    def note(scenario, device):
+        rest.append(scenario.scenario_id)
+        return original(scenario, device)
 
-    monkeypatch.setattr(module, "_evaluate_scenario", note)
+    monkeypatch.setattr(module, "scenario_log", note)
     assert same(evaluate(Wobble(), data, tmp_path, CONFIG, name="cut"), whole)
     assert rest == ["gaps", "again", "crowd"]
     assert not (tmp_path / "cut.parts").exists()
