@@ -166,7 +166,7 @@ BAD = [
     (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
     (
         ["join"],
-        "^join: write the command of a share behind join, .* are augment, convert, evaluate, failures, score, simulate,",
+        "^join: write the command of a share behind join, .* are augment, convert, evaluate, failures, score, ",
     ),
     (["join", "foo"], "^join foo: write the command of a share behind join"),
     (["join", "pretrain", "--help"], "^join pretrain --help: write the command of a share behind join"),
@@ -179,7 +179,7 @@ BAD = [
     (["evaluate", "oracle", "--data", "synthetic", "--out", "gs://b/c/"], "^gs://b/c/ is an address: name a folder"),
     (
         ["convert", "a", "b", "--item-log", "s3://b/c"],
-        "^s3://b/c is an address: name a folder or a file of this machine",
+        "^s3://b/c is an address: name a folder or a file",
     ),
 ]
 
