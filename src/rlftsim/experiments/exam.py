@@ -27,7 +27,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation
-from rlftsim.experiments.rows import RMM, Row
+from rlftsim.experiments.tables import RMM, Row
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import append_text
 from rlftsim.policies.registry import Device, load_policy

@@ -23,7 +23,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.evaluation.results import Evaluation, GoalChoice
 from rlftsim.experiments.model_specs import BASE, CATK, GCSL, ROAD, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
-from rlftsim.experiments.rows import Row
+from rlftsim.experiments.tables import Row
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
 from rlftsim.recipes.base import Recipe
