@@ -12,7 +12,10 @@ from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.open import to_scenarios
-from rlftsim.training.goal_relabeling import NOT_VALIDATED
+from rlftsim.training.calibrate import CalibrateConfig
+from rlftsim.training.catk import CatkConfig, RoadConfig
+from rlftsim.training.finetune_config import FinetuneConfig
+from rlftsim.training.goal_relabeling import NOT_VALIDATED, GcslConfig
 from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, Processes, Settings
@@ -124,14 +127,11 @@ def finetune(
         NotYetError: Another run is at work in the folder.
     """
     if isinstance(config, PretrainConfig) or find_method(config) is None:
-        check_config(
-            config, "finetune", *(method_by_name(name).settings for name in ("rlft", "catk", "gcsl", "calibrate"))
-        )
+        check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training = to_scenarios(scenarios, split)
     settings: Any = config
     if settings is None:
-        sections = {name: method_by_name(name).settings() for name in ("road", "calibrate")}
-        base = Recipe(**sections) if recipe is None else to_recipe(recipe)
+        base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
         # a recipe that is handed over has what it should have
         if not isinstance(recipe, Recipe):
             base = _complete_recipe(base, find_section(method), has_goals=goal is not None)
