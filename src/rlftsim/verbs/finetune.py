@@ -138,7 +138,7 @@ def finetune(
         settings = _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
     settings = with_processes(settings, processes)
     trainer = find_method(settings)
-    interval = settings.validation.interval if trainer is not None and trainer.validates else 0
+    interval = settings.validation.every if trainer is not None and trainer.validates else 0
     held_out = find_held_out(scenarios, validation_split, interval)
     learner, device = load_start(policy)
     conditioning = "" if goal is None else GoalConditioning(goal, goal_logit_bias)
