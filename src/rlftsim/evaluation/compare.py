@@ -70,11 +70,8 @@ class PairedDifference:
         numbers = f"{self.difference:+.4f}, {level:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
         if not self.is_difference:
             return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
-        direction = find_direction(self.column)
-        if direction == "log":  # neither more nor less is better
-            return f"difference: {numbers}."
-        is_gain = (self.difference > 0) == (direction == "higher")
-        return f"difference, for the {'better' if is_gain else 'worse'}: {numbers}."
+        word = self._judge()
+        return f"difference{'' if word == 'differs' else f', for the {word}'}: {numbers}."
 
     @property
     def cells(self) -> tuple[str, ...]:

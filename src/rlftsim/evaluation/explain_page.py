@@ -62,7 +62,6 @@ def explain_rollouts(
     config: ScoreConfig = ScoreConfig(),  # noqa: B008
     *,
     runner: Runner | None = None,
-    show_progress: bool = True,
 ) -> list[Path]:
     """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
 
@@ -75,7 +74,6 @@ def explain_rollouts(
         out: Folder of the pages, made if missing.
         config: Metric, handling of missing maps and scenarios, processes.
         runner: Runner of the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
-        show_progress: False prints neither progress nor the time left.
 
     Raises:
         DataError: Rollouts or scenarios that `score_rollouts` refuses, or another driver at work on these pages.
@@ -96,7 +94,7 @@ def explain_rollouts(
     with Lease(pages / ".lock", runner, "works in") as lease:
         finished = run_items(
             "explain", list(items.items()), partial(_write_page, pages, source, config), lease=lease, runner=runner,
-            format=WholeFiles(pages, itemgetter(0), _read_page), show_progress=show_progress,
+            format=WholeFiles(pages, itemgetter(0), _read_page),
         )  # fmt: skip
         written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
         lease.remove()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.explain import to_scene_motion
@@ -166,14 +166,14 @@ def _read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:
 
 def _outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
     """Table of goals and outcomes, for `print_wide`."""
+    headings = ("scenario", "agent", "label", "reached", "passed", "closest [m]: best", "median")
     table = Table(
+        *(Column(heading, overflow="fold") for heading in headings),
         title="goals: within 2 m in the end (reached), at any time (passed)",
         caption="closest: smallest distance to the goal, in the best rollout and in the median one",
         title_justify="left",
         caption_justify="left",
     )
-    for heading in ("scenario", "agent", "label", "reached", "passed", "closest [m]: best", "median"):
-        table.add_column(heading, overflow="fold")
     for entry, o in outcomes:
         numbers = (f"{o.reached:.0%}", f"{o.passed:.0%}", f"{o.best_m:.1f}", f"{o.median_m:.1f}")
         table.add_row(entry.scenario_id, str(entry.agent_id), entry.label, *numbers)

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from rlftsim.errors import ConfigError, DataError
@@ -243,12 +243,11 @@ def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: 
     num_items = max(round(WOMD_PIECES[plan] * total / WOMD_SCENARIOS[plan]), 1)
     agents = "" if math.isnan(cost.mean_agents) else f", {cost.mean_agents:.0f} agents on average"
     table = Table(
+        *(Column(heading, justify="right") for heading in ("machines", "cores", "time", "price")),
         title=f"{plan}: {total} scenarios of {cost.seconds:.3g} s ({cost.num_measured} measured here{agents})",
         caption=f"at ${price:g} for a core and hour; without reading over a network and starting machines",
         title_justify="left", caption_justify="left",
     )  # fmt: skip
-    for heading in ("machines", "cores", "time", "price"):
-        table.add_column(heading, justify="right")
     for machines, num_cores in dict.fromkeys([(1, 1), (1, cores), (nodes, cores)]):
         seconds = forecast_s(cost.seconds, total, num_items, machines * num_cores)
         dollars = cost.seconds * total / 3600 * price

@@ -62,9 +62,8 @@ def propose_goals(
     for scenario_id in dict.fromkeys(scenario):
         check_membership(scenarios, scenario_id, data, "--scenario")
         logged = scenarios.by_id(scenario_id)
-        table = Table(title=f"scenario {scenario_id}", title_justify="left")
-        for heading in ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]"):
-            table.add_column(heading)
+        headings = ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]")
+        table = Table(*headings, title=f"scenario {scenario_id}", title_justify="left")
         for track in _find_tracks(logged, agent):
             proposals = propose(logged, track)
             goal = next((proposal for proposal in proposals if _is_choice(proposal, choose)), None)

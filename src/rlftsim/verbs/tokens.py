@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.folder import check_file
@@ -97,10 +97,8 @@ def tokens(
     compared = len(scenarios) if settings.max_scenarios is None else min(len(scenarios), settings.max_scenarios)
     write_vocabulary_report(folder, classes, vocabulary=source.name, data=f"{compared} scenarios of {data}, {split}")
     # 3. the same numbers as in the report, on the terminal
-    table = Table(title="How well the tokens cover the data", title_justify="left")
-    table.add_column("")
-    for coverage in classes:
-        table.add_column(coverage.class_name, justify="right")
+    columns = (Column(coverage.class_name, justify="right") for coverage in classes)
+    table = Table("", *columns, title="How well the tokens cover the data", title_justify="left")
     for name, words in ROWS.items():
         table.add_row(name, *(words(coverage) for coverage in classes))
     print_wide(table)
