@@ -23,6 +23,7 @@ from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.submission.build import build_archive, delete_shards, forecast_size

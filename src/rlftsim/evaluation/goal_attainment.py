@@ -21,6 +21,7 @@ from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
+from rlftsim.jobs.runner import check_jobs
 from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset

@@ -7,7 +7,7 @@ from typing import Any
 from rlftsim.policies.calibrated.policy import CALIBRATION, read_calibration
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.viewer.chart import Chart, Curve
-from rlftsim.viewer.figure import charts_to_png
+from rlftsim.viewer.figure import Interval, charts_to_png, draw_intervals, save_figure
 
 Lines = Sequence[Mapping[str, Any]]
 """Values of each update, see `read_metrics`."""

@@ -22,10 +22,12 @@ from rlftsim.evaluation.evaluate import describe_measurement, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
+from rlftsim.jobs.runner import check_jobs
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.rollout.policy import Policy, get_device
+from rlftsim.rollout.policy import Policy, frozen_copy, get_device
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)

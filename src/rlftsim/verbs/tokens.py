@@ -106,9 +106,7 @@ def tokens(
         if coverage.num_tokens == 1 and coverage.use.sum() > 1:
             log.info(f"{coverage.class_name}s have a single token, which stands still: their motion cannot be learned.")
     counts = ", ".join(f"{c.num_tokens} {c.class_name}" for c in classes)
-    print(
-        f"{vocabulary_path}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md"
-    )
+    print(f"{source}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
 
 
 def _check_is_vocabulary(path: Path) -> None:
