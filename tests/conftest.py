@@ -15,6 +15,9 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 BROWSER = os.environ.get("RLFTSIM_BROWSER", "chromium")
 """Or "firefox", of `playwright install firefox`."""
 
+# pytest-xdist sets the width of its own terminal
+os.environ.pop("COLUMNS", None)
+
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
 settings.load_profile("rlftsim")
@@ -31,6 +34,12 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no official material at {folder}: set RLFTSIM_SHARED to compare with it")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def forget_the_width(monkeypatch):
+    """Tables are as wide as in a file unless a test says another width."""
+    monkeypatch.delenv("COLUMNS", raising=False)
 
 
 @pytest.fixture(autouse=True)

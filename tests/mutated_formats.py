@@ -569,7 +569,10 @@ FORMATS: Mapping[str, Format] = {
         ("policies.smart.catk_checkpoint",),
     ),
     "run": Format(
-        {"run/config.json": "json", "run/metrics.jsonl": "jsonl"}, make_run, read_run, ("training.run_folder",)
+        {"run/config.json": "json", "run/metrics.jsonl": "jsonl"},
+        make_run,
+        read_run,
+        ("training.run_folder", "verbs.runs"),
     ),
     "checkpoint of a run": Format(
         {"run/checkpoints/*4/*.safetensors": "safetensors", "run/checkpoints/*4/*.json": "json"},

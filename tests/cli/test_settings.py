@@ -166,7 +166,7 @@ BAD = [
     (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
     (
         ["join"],
-        "^join: write the command of a share behind join, .* are augment, convert, evaluate, failures, score, ",
+        "^join: write the command of a share behind join, .* are augment, convert, evaluate, failures, score,",
     ),
     (["join", "foo"], "^join foo: write the command of a share behind join"),
     (["join", "pretrain", "--help"], "^join pretrain --help: write the command of a share behind join"),
@@ -177,10 +177,7 @@ BAD = [
         "^s3://b/c is an address, .*: `rlftsim convert 'my files' FOLDER --jobs 2`, then `rlftsim data push FOLDER s3:",
     ),
     (["evaluate", "oracle", "--data", "synthetic", "--out", "gs://b/c/"], "^gs://b/c/ is an address: name a folder"),
-    (
-        ["convert", "a", "b", "--item-log", "s3://b/c"],
-        "^s3://b/c is an address: name a folder or a file",
-    ),
+    (["convert", "a", "b", "--item-log", "s3://b/c"], "^s3://b/c is an address: name a folder or a file"),
 ]
 
 

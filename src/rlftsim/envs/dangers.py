@@ -94,7 +94,7 @@ class StepView:
     @property
     def acceleration(self) -> float:
         """Change of speed over the last step, m/s²; 0 before the first."""
-        before, now = (signed_speed(step[self.index]) for step in self.state.world.track[-2:])
+        before, now = (signed_speed(step[self.index][None])[0] for step in self.state.world.track[-2:])
         return float(now - before) / STEP_S if self.step else 0.0
 
     def others(self, reach_m: float = np.inf) -> np.ndarray:
@@ -138,7 +138,7 @@ class Contact:
         turn_rate = np.where(np.hypot(now[:, 3], now[:, 4]) < STANDING_MPS, 0.0, turn_rate)
         other, size, time = now[rows], world_size[rows], AHEAD_S[:, None]
         # 1. poses of the planner that goes on and of one that brakes, and of the others
-        speed = max(float(signed_speed(now[agent])), 0.0)
+        speed = max(float(signed_speed(now[agent][None])[0]), 0.0)
         driving_s = np.stack([AHEAD_S, np.minimum(AHEAD_S, speed / ACCELERATION_MPS2)])  # [2, t]
         driven = np.stack([speed * AHEAD_S, speed * driving_s[1] - ACCELERATION_MPS2 / 2 * driving_s[1] ** 2])
         ego = _arc(now[agent], driven, turn_rate[agent] / max(speed, STANDING_MPS) * driven)  # [2, t, 3]
@@ -221,7 +221,7 @@ class RedLight:
         ahead = lights.point - view.ego[:2]
         forward = ahead @ [np.cos(view.ego[2]), np.sin(view.ego[2])]
         distance = np.hypot(*ahead.T)[forward > 0]
-        speed = float(signed_speed(view.ego))
+        speed = float(signed_speed(view.ego[None])[0])
         return NEVER if not len(distance) else min(
             speed / (2 * ACCELERATION_MPS2) - float(distance.min()) / max(speed, STANDING_MPS), NEARLY
         )  # fmt: skip

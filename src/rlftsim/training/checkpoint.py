@@ -120,6 +120,25 @@ def read_checkpoint(
     return Progress(values["update"], values["numbers"])
 
 
+def load_weights(path: Path, module: nn.Module) -> None:
+    """Load the weights in a file into a module, in place.
+
+    Args:
+        path: Safetensors file of a run.
+        module: Module with weights of these names, shapes and types.
+
+    Raises:
+        FileNotFoundError: No such file.
+        CheckpointError: Damaged file, or weights of a different module.
+    """
+    weights, _ = read_tensors(path, "remove it and train again", error=CheckpointError)
+    try:
+        _check_weights(path.stem, weights, module)
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}: remove it and train again.") from None
+    module.load_state_dict(weights)
+
+
 def _read(path: Path, way_out: str) -> dict[str, Tensor]:
     try:
         return read_tensors(path, way_out, error=CheckpointError)[0]

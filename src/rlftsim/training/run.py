@@ -16,14 +16,20 @@ from typing import Any
 import torch
 
 from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
-from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.files import save_tensors
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
+from rlftsim.training.checkpoint import (
+    Progress,
+    load_weights,
+    newest_checkpoint,
+    parse_update,
+    read_checkpoint,
+    write_checkpoint,
+)
 from rlftsim.training.data import share_cache
 from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
@@ -255,7 +261,7 @@ class TrainingRun:
             stop.args = (f"continues behind update {parse_update(newest)}" if newest else "starts anew",)
             raise
 
-    def keep_best(self, values: Mapping[str, float]) -> None:
+    def keep_best(self, values: Mapping[str, Any]) -> None:
         """Keep the weights if this is the best validation so far.
 
         Args:
@@ -264,7 +270,7 @@ class TrainingRun:
         if self._choose_best({**values, "update": self._learner.update}) and self._fabric.is_global_zero:
             save_tensors(self.folder.best(self._learner.update), self._learner.result.state_dict())
 
-    def _choose_best(self, values: Mapping[str, float]) -> bool:
+    def _choose_best(self, values: Mapping[str, Any]) -> bool:
         """Compare a validation with the best so far; True if it is better."""
         bound = values.get("validation_gain_low", math.nan)
         if math.isfinite(bound) and (self._best is None or bound > self._best[0]):
@@ -338,10 +344,9 @@ class TrainingRun:
             return
         bound, update = self._best
         try:
-            weights, _ = read_tensors(self.folder.best(update), "train again", error=CheckpointError)
+            load_weights(self.folder.best(update), learner.result)
         except FileNotFoundError:  # an earlier start of the run had validated without keeping the best
             return
-        learner.result.load_state_dict(weights)
         if self._fabric.is_global_zero:
             log.info(
                 f"{self.folder.model} is the model of update {update}: its gain in RMM over the start is at least "
