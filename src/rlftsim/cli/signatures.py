@@ -147,7 +147,7 @@ def settings_parser(settings: Any) -> Callable[..., Any]:
 def with_parameters(
     make: Callable[..., Any], description: str, parameters: Sequence[inspect.Parameter]
 ) -> Callable[..., Any]:
-    """A function of some parameters that calls another one with their values by name.
+    """A function of some parameters that calls a given function with the values by name.
 
     Args:
         make: Function to call.
@@ -170,7 +170,7 @@ def list_flags(words: Sequence[str]) -> list[str]:
 
 
 def to_required_type(annotation: Any) -> Any:
-    """A type without None, which nobody gives where a value is required."""
+    """A type without None, for a required value."""
     choices = [cls for cls in get_args(annotation) if cls is not types.NoneType]
     return Union[tuple(choices)] if get_origin(annotation) in (Union, types.UnionType) else annotation  # noqa: UP007
 

@@ -1,4 +1,4 @@
-"""What follows a simulation: outcomes of goals, pictures, and further files of `rlftsim simulate --export NAME`.
+"""Work after a simulation: outcomes of goals, pictures, and further files of `rlftsim simulate --export NAME`.
 
 A package of your own adds an exporter:
 
@@ -110,13 +110,13 @@ def report_rollouts(
     picture: bool,
     exporters: Sequence[Exporter],
 ) -> None:
-    """Print a table of goals and their outcomes, draw scenarios, and export them.
+    """Print a table of goals and outcomes, draw scenarios, and export scenarios.
 
     Args:
         folder: Folder of rollouts of `rlftsim simulate`.
         dataset: Data set of the simulated scenarios.
         scenario_ids: Ids of the simulated scenarios.
-        goals: Goals of their agents; may be empty.
+        goals: Goals of the simulated agents; may be empty.
         picture: True draws FOLDER/SCENARIO.png.
         exporters: Functions that write further files of each scenario.
 

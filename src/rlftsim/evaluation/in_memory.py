@@ -25,7 +25,7 @@ from rlftsim.scenario.types import CURRENT_STEP
 def simulate_in_memory(
     policy: Policy, batch: ScenarioBatch, num_rollouts: int, seed: int, sampling: Sampling, goals: Any
 ) -> Rollouts:
-    """Rollouts of a batch with their provenance, simulated one scenario after another.
+    """Rollouts of a batch with their provenance, simulated scenario by scenario.
 
     Args:
         policy: Policy in evaluation mode.
@@ -36,8 +36,8 @@ def simulate_in_memory(
         goals: Points, or goals of the whole batch, as for `rs.simulate`; None = goal-free.
 
     Raises:
-        ConfigError: Goals of another type, frame, batch or number of rollouts, or without effect on the policy.
-        DataError: A goal of an agent that is not simulated, out of its reach, or not two finite numbers.
+        ConfigError: Goals of a wrong type, frame, batch or number of rollouts, or without effect on the policy.
+        DataError: A goal of an agent that is not simulated, a goal out of reach, or not two finite numbers.
     """
     placed = _place_goals(goals, batch, num_rollouts)
     has_goals = placed.goal_mask.any(-1).any(-1).tolist()  # [B]
@@ -81,7 +81,7 @@ def simulate_in_memory(
 
 
 def _place_goals(goals: Any, batch: ScenarioBatch, num_rollouts: int) -> Goals:
-    """Goals of a batch, in its frame and on its device."""
+    """Goals in the frame and on the device of a batch."""
     if not isinstance(goals, Goals | Mapping | None):
         raise ConfigError(
             f"goals must be {{object_id: (x, y)}}, {{scenario_id: {{object_id: (x, y)}}}} or Goals, got {goals!r}."
@@ -107,10 +107,10 @@ def _place_goals(goals: Any, batch: ScenarioBatch, num_rollouts: int) -> Goals:
 
 
 def _check_reach(goals: Goals, batch: ScenarioBatch) -> None:
-    """Refuse goals that nothing reaches in 8 seconds: mostly points of another frame.
+    """Check that goals can be reached in 8 seconds: others are mostly points of a different frame.
 
     Raises:
-        DataError: Such a goal; names the agent.
+        DataError: A goal too far away; names the agent.
     """
     offset = goals.position - batch.position[:, None, :, CURRENT_STEP]  # [B, N, A, 2]
     distance = torch.where(goals.goal_mask, offset.norm(dim=-1), 0.0).amax(1)  # [B, A]
@@ -125,13 +125,13 @@ def _check_reach(goals: Goals, batch: ScenarioBatch) -> None:
 
 
 def score_in_memory(batch: ScenarioBatch, rollouts: Rollouts, metric: str, *, is_single: bool) -> RealismResult:
-    """Scores of rollouts, with a warning for each doubt about them.
+    """Scores of rollouts, with a warning for each doubt.
 
     Args:
-        batch: Scenarios with their logged futures, in any frame.
+        batch: Scenarios with logged futures, in any frame.
         rollouts: Rollouts of all scenarios of the batch, in the same order.
         metric: Year of the meta-metric.
-        is_single: True leaves out the leading axis of B scenarios; the batch has one.
+        is_single: True leaves out the leading axis of B scenarios, for a batch of a single scenario.
 
     Raises:
         ConfigError: Rollouts of other scenarios, or no such metric.
@@ -150,7 +150,7 @@ def _match_batch(batch: ScenarioBatch, rollouts: Rollouts) -> ScenarioBatch:
     """The scenarios that rollouts are of, in the frame of the rollouts.
 
     Raises:
-        ConfigError: They are of other scenarios: by the ids of scenarios and agents where the rollouts know them, else
+        ConfigError: Rollouts of other scenarios: by the ids of scenarios and agents where the rollouts have ids, else
             by numbers.
     """
     about = rollouts.provenance

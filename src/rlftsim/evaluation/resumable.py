@@ -1,7 +1,7 @@
 """Interruptible measurements of many scenarios: finished groups are stored in files, a later call does the others.
 
 Evaluations and scores of rollout files are stored as `ScenarioRows` (Parquet), goal attainment, reward variances and
-planners as `ScenarioValues` (JSON). Whoever joins the groups in the file of a result holds a `Claim` on it.
+planners as `ScenarioValues` (JSON). A `Claim` is the right to join the groups in the file of a result.
 """
 
 import json
@@ -237,7 +237,7 @@ def run_groups(
         scenario_ids: Ids of all scenarios, in the order of the groups.
         work: Function from the position of a scenario to the result of the scenario.
         format: Files of the groups.
-        lease: Lock on their folder.
+        lease: Lock on the folder of the files.
         runner: Runner of the groups that are missing; changes no result.
         show_progress: False prints neither progress nor the time left.
     """
@@ -262,7 +262,7 @@ class Claim(Generic[FinishedResult]):
     """The right to make a result, or the result that an earlier call has finished."""
 
     result: FinishedResult | None
-    """Set by whoever makes a missing result."""
+    """None until the missing result is made."""
     lease: Lease | None
     """Lock on the folder of the groups; None where the result is finished."""
 

@@ -1,4 +1,4 @@
-"""Plan of a submission: the scenarios of each shard, the settings that its bytes depend on; the input of a build."""
+"""Plan of a submission: the scenarios of each shard, the settings that bytes depend on, and the input of a build."""
 
 import hashlib
 import re
@@ -207,7 +207,7 @@ def prepare_job(
 
     Args:
         entry: Account, method and authors.
-        policy: Policy whose rollouts are submitted; a frozen copy of it is taken.
+        policy: Policy whose rollouts are submitted; left unchanged, as a frozen copy is used.
         data: Scenarios of the split that is simulated.
         config: Settings of the simulation.
         folder: Folder of the archive.

@@ -198,7 +198,7 @@ def check_goal_effects(goals: GoalsFile, policy: Policy, name: str, guidance_sca
 
     Args:
         goals: Goals of the simulated agents; may be empty.
-        policy: Policy that simulates.
+        policy: Policy that decides for all agents.
         name: Name of the policy, for messages.
         guidance_scale: Factor on the goal-progress bias; 1 = as learned.
 
@@ -217,14 +217,14 @@ def check_goal_effects(goals: GoalsFile, policy: Policy, name: str, guidance_sca
 def check_scenarios(
     scenario_ids: Sequence[str], goals: GoalsFile, dataset: ScenarioDataset, name: str, has_scenario_flag: bool
 ) -> None:
-    """Check scenarios and goals that are to be simulated, and log what is doubtful about them.
+    """Check scenarios and goals that are to be simulated, and log doubts.
 
     Args:
         scenario_ids: Ids of the scenarios.
-        goals: Goals of their agents; may be empty.
+        goals: Goals of agents in the scenarios; may be empty.
         dataset: Data set that must have the scenarios.
         name: Name of the data set, for messages.
-        has_scenario_flag: True where the ids are those of `--scenario`, else they are those of goals.
+        has_scenario_flag: True where the ids are those of `--scenario`, else those of goals.
 
     Raises:
         DataError: An unknown scenario, or an impossible goal.

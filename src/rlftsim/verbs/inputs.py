@@ -149,16 +149,16 @@ def check_config(config: object, section: str, *classes: type) -> None:
 
 
 def check_left_out(verb: Callable[..., Any], values: Mapping[str, Any], names: Sequence[str], reason: str) -> None:
-    """Check that arguments without effect have their defaults.
+    """Check that arguments without effect have the default values.
 
     Args:
         verb: Function with the defaults.
-        values: Values by argument.
-        names: Arguments without effect.
+        values: Values of the call by argument.
+        names: Names of the arguments without effect.
         reason: Rest of the message, behind the argument.
 
     Raises:
-        ConfigError: An argument has another value.
+        ConfigError: An argument has a different value.
     """
     for name in names:
         if values[name] != inspect.signature(verb).parameters[name].default:
