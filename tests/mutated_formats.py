@@ -81,11 +81,12 @@ def run(*words: object) -> None:
     Raises:
         RlftsimError: It ends with one line.
     """
-    verb = parse([str(word) for word in words])
+    call = parse([str(word) for word in words])
     try:
-        verb.run()
+        call.show(call.command.function(**call.arguments))
     except OSError as error:  # the command names what the machine says, in one line
-        with contextlib.redirect_stderr(None), mock.patch.object(type(verb), "run", side_effect=error):
+        failing = mock.PropertyMock(side_effect=error)
+        with contextlib.redirect_stderr(None), mock.patch.object(type(call), "arguments", failing):
             status = main([str(word) for word in words])
         raise NotRead(f"{error.strerror}: {error.filename} (status {status})") from None
 
