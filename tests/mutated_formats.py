@@ -648,7 +648,7 @@ FORMATS: Mapping[str, Format] = {
         {"out/plan.json": "json", "out/**/*.json": "json"},
         make_begun_build,
         build(),
-        ("submission.plan", "submission.build"),
+        ("submission.plan",),
     ),
     "token": Format(
         {"token": "text"},
