@@ -93,16 +93,13 @@ def evaluate(
     model = with_guidance(model, guidance_scale)
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)
-    if isinstance(data, str | os.PathLike):
-        return evaluation.evaluate(model, dataset_folder(data), out, config, name=name, runner=runner)
-    scenarios = to_scenarios(data)
-    if isinstance(scenarios, ScenarioDataset):
-        return evaluation.evaluate(model, scenarios, out, config, name=name, runner=runner)
-    # The evaluation reads scenarios by name, in other processes too, so those of a list get a data set.
+    source = dataset_folder(data) if isinstance(data, str | os.PathLike) else to_scenarios(data)
     with tempfile.TemporaryDirectory(prefix="rlftsim-") as temporary:
-        write_dataset((scenarios[position] for position in range(len(scenarios))), f"{temporary}/scenarios")
-        listed = ScenarioDataset(f"{temporary}/scenarios")
-        return evaluation.evaluate(model, listed, out, config, name=name, runner=runner)
+        # The evaluation reads scenarios by name, in other processes too, so those of a list get a data set.
+        if not isinstance(source, Path | ScenarioDataset):
+            write_dataset((source[position] for position in range(len(source))), f"{temporary}/scenarios")
+            source = ScenarioDataset(f"{temporary}/scenarios")
+        return evaluation.evaluate(model, source, out, config, name=name, runner=runner)
 
 
 def print_evaluation(result: Evaluation, *, out: Path) -> None:
