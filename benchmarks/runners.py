@@ -183,7 +183,7 @@ def row_plan(options):
     from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
     from rlftsim.policies.registry import load_policy
     from rlftsim.scenario.dataset import ScenarioDataset
-    from rlftsim.verbs.plan import measure_cost
+    from rlftsim.verbs.doctor import measure_cost
 
     cost = measure_cost("evaluate", options.model, "synthetic", 5)
     total = len(ScenarioDataset("synthetic", options.split))

@@ -24,11 +24,11 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.realism import SimulatedStates
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.submission.build import Job, build_archive
+from rlftsim.submission.build import build_archive
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.entry import Entry, describe_entry
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts
-from rlftsim.submission.plan import make_plan
+from rlftsim.submission.plan import Job, make_plan
 
 METADATA = describe_entry(Entry("jane@doe.edu", "Benchmark", ("Jane",), "Doe", "Measured.", "https://doe.edu"), "0")
 NUM_SHARDS = 12

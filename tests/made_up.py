@@ -3,7 +3,7 @@
 import pyarrow as pa
 
 from rlftsim.evaluation.results import SCHEMA, SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance
-from rlftsim.experiments.rows import Row
+from rlftsim.experiments.tables import Row
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.tokens.clustering import TokensConfig

@@ -24,12 +24,12 @@ from av2_files import write_av2
 from rlftsim.cli.main import main, parse
 from rlftsim.envs import EgoEnv
 from rlftsim.errors import RlftsimError
-from rlftsim.evaluation.calibration_picture import write_calibration_picture
 from rlftsim.evaluation.drive_results import DriveResult
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.evaluation.goal_attainment import attain_goals
+from rlftsim.evaluation.learning_curve import write_calibration_picture
 from rlftsim.evaluation.reward_variance import measure_variances
-from rlftsim.experiments.ledger import Ledger
+from rlftsim.experiments.exam import Ledger
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_file
 from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
@@ -81,11 +81,12 @@ def run(*words: object) -> None:
     Raises:
         RlftsimError: It ends with one line.
     """
-    verb = parse([str(word) for word in words])
+    call = parse([str(word) for word in words])
     try:
-        verb.run()
+        call.show(call.command.function(**call.arguments))
     except OSError as error:  # the command names what the machine says, in one line
-        with contextlib.redirect_stderr(None), mock.patch.object(type(verb), "run", side_effect=error):
+        failing = mock.PropertyMock(side_effect=error)
+        with contextlib.redirect_stderr(None), mock.patch.object(type(call), "arguments", failing):
             status = main([str(word) for word in words])
         raise NotRead(f"{error.strerror}: {error.filename} (status {status})") from None
 
@@ -585,7 +586,7 @@ FORMATS: Mapping[str, Format] = {
         {"exam.jsonl": "json"},
         make_ledger,
         lambda folder: Ledger(folder / "exam.jsonl").count_looks("e", "r", ["f" * 32], is_repeat=True),
-        ("experiments.ledger",),
+        ("experiments.exam",),
     ),
     "goals": Format(
         {"goals.json": "json"},
@@ -647,7 +648,7 @@ FORMATS: Mapping[str, Format] = {
         {"out/plan.json": "json", "out/**/*.json": "json"},
         make_begun_build,
         build(),
-        ("submission.plan", "submission.build"),
+        ("submission.plan",),
     ),
     "token": Format(
         {"token": "text"},

@@ -25,6 +25,7 @@ from rlftsim.envs.source import Source
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig
+from rlftsim.jobs.runner import Work
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.scenario.batch import collate
@@ -684,6 +685,18 @@ ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
         *((lambda d, s=s: rs.simulate(CV, d, seed=s), "seed must be a whole number, got") for s in ("a", None, 1.5)),
         *((lambda d, s=s: rs.evaluate(CV, d, seed=s), "seed must be a whole number, got") for s in ("a", None, 1.5)),
         (lambda d: rs.simulate(CV, d, sampling=0.5), "sampling must be rs.Sampling"),
+        *(
+            (lambda d, o=o: rs.simulate(CV, d, **o), f"{next(iter(o))} has no effect on rollouts in memory: leave it")
+            for o in ({"jobs": 2}, {"work": Work(on_error="stop")}, {"limit": 1}, {"picture": True})
+        ),
+        (lambda d: rs.simulate(CV, d, guidance_scale=2.0), "guidance_scale=2 has no effect without goals: add goals"),
+        *(
+            (
+                lambda d, o=o: rs.score(d, rs.simulate(CV, d, num_rollouts=2), **o),
+                f"{next(iter(o))} has no effect on rollouts in memory: leave it out, or name files of rollouts",
+            )
+            for o in ({"missing_map": "skip"}, {"missing_scenario": "skip"}, {"work": Work(share="1/2")}, {"jobs": 1})
+        ),
         *((lambda d, g=g: rs.evaluate(CV, d, goals=g), GOALS) for g in ("Logged", True, None, {})),
         *((lambda d, g=g: rs.simulate(CV, d, goals=g), "goals must be {object_id") for g in ([], (1, 2), "a", 3)),
         *((lambda d, p=p: rs.simulate(p, d), "is not a policy") for p in (None, 3, [], torch.nn.Linear(1, 1))),

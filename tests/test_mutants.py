@@ -39,7 +39,6 @@ NO_FORMAT = {
     "experiments.paper.published": "the paper's tables in the box",
     "jobs.buckets": "copies bytes that it does not look at",
     "studio.server": "the page in the box",
-    "submission.transfer": "copies bytes that it does not look at",
     "training.parallel": "bytes of this program's own processes",
     "viewer.page": "the page in the box",
     "jobs.processes": "code that the user runs anyway, and bytes of this program's own processes",

@@ -177,6 +177,7 @@ BAD = [
         "^s3://b/c is an address, .*: `rlftsim convert 'my files' FOLDER --jobs 2`, then `rlftsim data push FOLDER s3:",
     ),
     (["evaluate", "oracle", "--data", "synthetic", "--out", "gs://b/c/"], "^gs://b/c/ is an address: name a folder"),
+    (["convert", "a", "b", "--item-log", "s3://b/c"], "^s3://b/c is an address: name a folder or a file"),
 ]
 
 

@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as module
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
-from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation, run_groups
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -158,26 +158,26 @@ def test_an_evaluation_comes_back_from_its_file(data, tmp_path):
 
 def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeypatch):
     whole = evaluate(Wobble(), data, tmp_path, CONFIG, name="whole")
-    original, seen = module._evaluate_scenario, []
+    original, seen = module.scenario_log, []
 
-    def interrupt_at_the_sixth(*work):
+    def interrupt_at_the_sixth(scenario, device):
         if len(seen) == 5:
             raise KeyboardInterrupt
-        seen.append(work[-1])
-        return original(*work)
+        seen.append(scenario.scenario_id)
+        return original(scenario, device)
 
-    monkeypatch.setattr(module, "_evaluate_scenario", interrupt_at_the_sixth)
+    monkeypatch.setattr(module, "scenario_log", interrupt_at_the_sixth)
     with pytest.raises(KeyboardInterrupt):
         evaluate(Wobble(), data, tmp_path, CONFIG, name="cut")
     assert not (tmp_path / "cut.parquet").exists()
     assert len(list((tmp_path / "cut.parts").glob("*.parquet"))) == 1
     rest = []
 
-    def note(policy, dataset, config, position):
-        rest.append(dataset.scenario_ids[position])
-        return original(policy, dataset, config, position)
+    def note(scenario, device):
+        rest.append(scenario.scenario_id)
+        return original(scenario, device)
 
-    monkeypatch.setattr(module, "_evaluate_scenario", note)
+    monkeypatch.setattr(module, "scenario_log", note)
     assert same(evaluate(Wobble(), data, tmp_path, CONFIG, name="cut"), whole)
     assert rest == ["gaps", "again", "crowd"]
     assert not (tmp_path / "cut.parts").exists()
@@ -336,9 +336,9 @@ def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, t
         return {"scenario_id": scenario_id, **row} if position % 3 else module.Skipped(scenario_id, "a third is")
 
     ids = [f"s{position}" for position in range(10)]
-    result = resume_evaluation(
-        "made", ids, work, name="made", provenance=provenance, out=tmp_path, runner=Inline(), show_progress=False
-    )
+    with claim_evaluation("made", provenance, tmp_path, ids, Inline()) as (rows, claim):
+        claim.result = rows.join(run_groups("made", ids, work, rows, claim.lease, Inline(), show_progress=False))
+    result = ScenarioRows("made", provenance, tmp_path).read_finished(ids)
     assert (done, result.scenario_ids) == (list(range(10)), ["s1", "s2", "s4", "s5", "s7", "s8"])
     assert [skipped.scenario_id for skipped in result.skipped] == ["s0", "s3", "s6", "s9"]
 

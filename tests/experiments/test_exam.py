@@ -13,8 +13,7 @@ from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.experiments import exam
-from rlftsim.experiments.exam import ExamConfig, Examinee, ExamRow, find_seed, find_temperature
-from rlftsim.experiments.ledger import Ledger
+from rlftsim.experiments.exam import ExamConfig, Examinee, ExamRow, Ledger, find_seed, find_temperature
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import sumo

@@ -28,9 +28,8 @@ from rlftsim.experiments.paper import (
 )
 from rlftsim.experiments.registry import EXPERIMENTS, PAPER
 from rlftsim.experiments.results import ExperimentResult, run_experiment, to_finite
-from rlftsim.experiments.rows import mean_of_seeds
-from rlftsim.experiments.stage_progress import Stage, run_stages
-from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.suite import ExperimentSuite, Stage, run_stages
+from rlftsim.experiments.tables import mean_of_seeds
 from rlftsim.recipes.base import Recipe
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.realism import compute_mloo

@@ -8,7 +8,7 @@ from third_party import installed
 
 EXPERIMENT = """
 from rlftsim.evaluation.columns import SCORES
-from rlftsim.experiments import tables
+from rlftsim.experiments.tables import build_table, draw_gains, to_numbers
 from rlftsim.experiments.model_specs import CONSTANT_VELOCITY, ORACLE
 from rlftsim.experiments.results import Experiment, ExperimentResult
 
@@ -20,10 +20,10 @@ def run(suite):
 def summarize(rows, suite):
     return ExperimentResult(
         title="Going straight on",
-        tables=(tables.build_table("Ours", rows.values(), SCORES),),
+        tables=(build_table("Ours", rows.values(), SCORES),),
         verdicts=(rows["straight on"].against(rows["log"]),),
-        numbers={"rows": tables.to_numbers(rows.values(), SCORES)},
-        figure=tables.draw_gains(rows["log"], [rows["straight on"]]),
+        numbers={"rows": to_numbers(rows.values(), SCORES)},
+        figure=draw_gains(rows["log"], [rows["straight on"]]),
     )
 
 

@@ -14,12 +14,12 @@ from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.evaluate import EvaluateConfig
-from rlftsim.experiments import tables
 from rlftsim.experiments.demo import DemoConfig, run_demo
 from rlftsim.experiments.model_specs import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.paper import qualitative, variance_scaling
 from rlftsim.experiments.results import Experiment, ExperimentResult, run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import build_table
 from rlftsim.recipes import train as training
 from rlftsim.recipes.base import Recipe
 from rlftsim.scenario.dataset import write_dataset
@@ -193,7 +193,7 @@ def test_an_experiment_of_ones_own_needs_two_functions(done):
         run=lambda suite: suite.evaluate(ROWS),
         summarize=lambda rows, suite: ExperimentResult(
             title="Mine",
-            tables=(tables.build_table("Ours", rows.values(), SCORES),),
+            tables=(build_table("Ours", rows.values(), SCORES),),
             verdicts=(rows["oracle"].against(rows["base"]),),
             numbers={"nothing": float("nan")},
         ),

@@ -11,7 +11,8 @@ import time
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim.cli.main import HAVE_SHARES, main
+from rlftsim.cli.main import main
+from rlftsim.cli.signatures import read_arguments
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.jobs import folder as folders
@@ -20,7 +21,7 @@ from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.verbs.commands import COMMANDS, read_arguments
+from rlftsim.verbs.commands import COMMANDS
 
 CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 
@@ -254,7 +255,7 @@ def test_the_commands_that_join_takes_are_those_with_shares():
         for name, command in COMMANDS.items()
     }
     with_shares = {name for name, kinds in annotations.items() if any(kind in (Machines, Work) for kind in kinds)}
-    assert with_shares == set(HAVE_SHARES)
+    assert with_shares == {name for name, command in COMMANDS.items() if command.has_shares}
 
 
 @pytest.mark.parametrize(

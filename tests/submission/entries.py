@@ -16,10 +16,9 @@ from rlftsim.realism import SimulatedStates
 from rlftsim.rollout.baselines import ConstantVelocity, PointMass
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.submission.build import Job
 from rlftsim.submission.entry import Entry, describe_entry
 from rlftsim.submission.messages import encode_rollouts
-from rlftsim.submission.plan import make_plan
+from rlftsim.submission.plan import Job, make_plan
 
 ENTRY = Entry(
     "jane.doe@university.edu", "A method", ("Jane Doe", "John Roe"), "A university", "A model.", "https://doe.edu/a"

@@ -23,11 +23,12 @@ from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.submission.build import build_archive, delete_shards, forecast_size
 from rlftsim.submission.check import check_archive
-from rlftsim.submission.closed_loop import check_closed_loop, statement
+from rlftsim.submission.entry import check_closed_loop, statement
 from rlftsim.submission.messages import round_states
 from rlftsim.submission.plan import check_complete, check_sources
 
@@ -227,7 +228,7 @@ def test_files_of_the_archive_are_read_by_score_bit_for_bit(data, whole, tmp_pat
     job = entries.make_job(data, tmp_path, num_shards=NUM_SHARDS)
     for entry in find_rollouts(tmp_path / "out"):
         states = read_states(entry)
-        expected = simulate_states(job.policy, data.by_id(entry.scenario_id), job.config, states.device)
+        expected = simulate_states(job.policy, collate([data.by_id(entry.scenario_id)]), job.config)
         for axis in ("x", "y", "z", "heading"):
             np.testing.assert_array_equal(getattr(states, axis).numpy(), getattr(expected, axis).numpy())
 

@@ -10,7 +10,8 @@ import pytest
 
 import rlftsim as rs
 from rlftsim.cli.main import main, parse
-from rlftsim.verbs.commands import COMMANDS, read_arguments
+from rlftsim.cli.signatures import read_arguments
+from rlftsim.verbs.commands import COMMANDS
 
 
 def help_words(command, capsys):

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
-from rlftsim.verbs.commands import FLAG, list_flags
+from rlftsim.cli.signatures import FLAG, list_flags
 
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
 
@@ -19,8 +19,8 @@ def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
     """
     if not words or words[0].startswith("-"):
         return f"missing: one of {','.join(actions)}."
-    near = difflib.get_close_matches(words[0], actions, 1)
-    hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(actions)}."
+    matches = difflib.get_close_matches(words[0], actions, 1)
+    hint = f"did you mean {matches[0]}?" if matches else f"known are {', '.join(actions)}."
     return f"no action {words[0]}: {hint}"
 
 
@@ -35,8 +35,8 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     flags = list(dict.fromkeys(FLAG.findall(help_text)))
     for flag in list_flags(words):
         if flag not in flags:
-            near = nearest(flag, flags)
-            return f"no flag {flag}: " + (f"did you mean {near}?" if near else "`--help` lists them all.")
+            suggestion = nearest(flag, flags)
+            return f"no flag {flag}: " + (f"did you mean {suggestion}?" if suggestion else "`--help` lists them all.")
     # `--switch yes`: tyro complains about the value alone
     left_over = re.search(r"Unrecognized options: (\S+)", complaint)
     for flag, word in pairwise(words):

@@ -16,10 +16,11 @@ from typing import Any, NoReturn
 import tyro
 
 from rlftsim.cli.mistakes import explain, explain_action
+from rlftsim.cli.signatures import FLAG, Call, describe, list_flags, make_parser
 from rlftsim.cli.stand_ins import stand_ins
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
-from rlftsim.verbs.commands import ACTIONS, COMMANDS, FLAG, Call, describe, list_flags
+from rlftsim.verbs.commands import COMMANDS, VERBS
 
 HELP = ("-h", "--help")
 COUNTS = (
@@ -67,7 +68,7 @@ def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
         raise ConfigError(explain_action(words, actions))
     with stand_ins():
         summaries = [describe(COMMANDS[f"{verb} {action}"].function).partition("\n")[0] for action in actions]
-    print(f"usage: rlftsim {verb} [-h] {{{','.join(actions)}}}\n\n{ACTIONS[verb]}\n")
+    print(f"usage: rlftsim {verb} [-h] {{{','.join(actions)}}}\n\n{VERBS[verb].description}\n")
     columns = shutil.get_terminal_size().columns
     for action, summary in zip(actions, summaries):
         print(textwrap.fill(summary, columns, initial_indent=f"  {action:9}", subsequent_indent=" " * 11))
@@ -83,7 +84,7 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
 
         flags = select_flags(name, command, words, recipe)
         complete = flags.read_file(words)
-    parser = command.parser(flags.settings if flags else {})
+    parser = make_parser(command, flags.settings if flags else {})
 
     def read(arguments: list[str]) -> Any:
         return tyro.cli(parser, args=arguments, prog=f"rlftsim {name}")
@@ -108,7 +109,8 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
     # Warnings on the way, such as that of a reward that is registered twice, are shown after all.
     if complaint.getvalue():
         log.warning(complaint.getvalue().rstrip())
-    _check_values(call.values, [*name.split(), *words])
+    flag_values = {argument: value for argument, value in call.values.items() if argument not in command.sections}
+    _check_values(flag_values, [*name.split(), *words])
     return finish_call(call, flags, list_flags(words)) if flags else call
 
 
@@ -123,14 +125,14 @@ def _help_text(read: Any) -> str:
 @contextmanager
 def _wide() -> Iterator[None]:
     """Let tyro write lines as long as they are: each message stands on one line of its box."""
-    before = os.environ.get("COLUMNS")
+    columns = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
         yield
     finally:
         del os.environ["COLUMNS"]
-        if before is not None:
-            os.environ["COLUMNS"] = before
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def _check_values(values: Mapping[str, Any], words: Sequence[str]) -> None:
@@ -150,15 +152,16 @@ def _check_values(values: Mapping[str, Any], words: Sequence[str]) -> None:
         if value in ([], ()) and flag in words:
             raise ConfigError(f"{flag} needs at least one value.")
         if isinstance(value, Path) and ADDRESS.match(str(value)):
-            _explain_address(value, words)
-        if name in ("config", "work", "sampling") and is_dataclass(value):
+            _explain_address(name, value, words)
+        if is_dataclass(value):
             _check_values(vars(value), words)
 
 
-def _explain_address(path: Path, words: Sequence[str]) -> None:
+def _explain_address(argument: str, path: Path, words: Sequence[str]) -> None:
     """Refuse an address of a bucket in place of a path, with the commands that bring the result there.
 
     Args:
+        argument: Name of the argument; only the destination of a data set has such commands.
         path: Path that was made of the address.
         words: Words of the whole command.
 
@@ -166,7 +169,7 @@ def _explain_address(path: Path, words: Sequence[str]) -> None:
         ConfigError: Always.
     """
     address = next((word for word in words if "://" in word and Path(word) == path), str(path))
-    if words[0] not in ("convert", "synthesize"):
+    if argument != "destination":
         raise ConfigError(
             f"{address} is an address: name a folder or a file of this machine here, and copy it by the bucket's own "
             "tools (docs/machines.md)."

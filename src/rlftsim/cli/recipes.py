@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 
+from rlftsim.cli.signatures import Call, list_flags, read_arguments
 from rlftsim.recipes.base import SECTIONS
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.verbs.commands import Call, Command, list_flags, read_arguments
+from rlftsim.verbs.commands import Command
 from rlftsim.verbs.recipe_flags import DEFAULT_RECIPE, RecipeFlags, check_no_settings, find_value
 
 
@@ -57,12 +58,12 @@ def guess_recipe_name(words: Sequence[str]) -> str:
     """Most likely name of the positional recipe. Only tyro knows for certain, once it has parsed the words."""
     # The value of a flag follows the flag, so it is not free. Second values of a flag are taken for free words;
     # they are names of recipes only by accident.
-    free, others = [], []
-    for before, word in zip(("", *words), words):
+    free, flag_values = [], []
+    for preceding_word, word in zip(("", *words), words):
         if not word.startswith("-"):
-            (others if before.startswith("--") and "=" not in before else free).append(word)
+            (flag_values if preceding_word.startswith("--") and "=" not in preceding_word else free).append(word)
     # Behind a switch, which takes no value, the recipe looks like the value of a flag.
-    registered = next((word for word in (*free, *others) if RECIPES.find(word) is not None), None)
+    registered = next((word for word in (*free, *flag_values) if RECIPES.find(word) is not None), None)
     # Nothing registered: the first free word is most likely a mistyped recipe, unless it is a number.
     mistyped = next((word for word in free if word.partition("-")[0].isalpha()), None)
     return registered or mistyped or DEFAULT_RECIPE

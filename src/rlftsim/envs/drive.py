@@ -35,8 +35,9 @@ from rlftsim.evaluation.resumable import (
     ScenarioValues,
     check_same_work,
     check_scenarios_stay,
-    finish_result,
+    claim_result,
     read_finished,
+    run_groups,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.progress import log
@@ -218,21 +219,16 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    return finish_result(
-        f"{config.planner} in {settings.traffic}",
-        ids,
-        partial(_drive_scenario, config, settings.traffic, ids),
-        path=path,
-        format=ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing),
-        find=partial(_read_finished, config, settings, ids, path),
-        combine=partial(_combine, settings),
-        runner=choose_runner(config.jobs, len(ids)),
-    )
-
-
-def _combine(settings: DriveSettings, rows: Sequence[tuple[dict[str, Any], dict[str, str]]]) -> DriveResult:
-    """Result of the rows of all scenarios and the scores that each cannot give."""
-    return DriveResult.of(settings, [row for row, _ in rows], {row["scenario_id"]: missing for row, missing in rows})
+    format = ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
+    runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
+    with claim_result(path, format, ids, find, runner) as claim:
+        if claim.lease is not None:
+            work = partial(_drive_scenario, config, settings.traffic, ids)
+            rows = run_groups(f"{config.planner} in {settings.traffic}", ids, work, format, claim.lease, runner)
+            missing = {row["scenario_id"]: reasons for row, reasons in rows}
+            claim.result = DriveResult.of(settings, [row for row, _ in rows], missing)
+    assert claim.result is not None
+    return claim.result
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:

@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -69,11 +70,8 @@ class PairedDifference:
         numbers = f"{self.difference:+.4f}, {level:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
         if not self.is_difference:
             return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
-        direction = find_direction(self.column)
-        if direction == "log":  # neither more nor less is better
-            return f"difference: {numbers}."
-        is_better = (self.difference > 0) == (direction == "higher")
-        return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
+        word = self._judge()
+        return f"difference{'' if word == 'differs' else f', for the {word}'}: {numbers}."
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -182,28 +180,42 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     )
 
 
-def pair_rows(a: Evaluation, b: Evaluation) -> tuple[list[int], list[int]]:
+@runtime_checkable
+class ScenarioResults(Protocol):
+    """Results with a row per scenario, such as an `Evaluation`."""
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+
+    @property
+    def scenario_ids(self) -> list[str]:
+        """Scenario of each row."""
+
+
+def pair_rows(a: ScenarioResults, b: ScenarioResults) -> tuple[list[int], list[int]]:
     """Rows of the scenarios that both have, in the order of the first.
 
     Args:
-        a: Evaluation that gives the order of the pairs.
-        b: Evaluation that is paired with `a`.
+        a: Results that give the order of the pairs.
+        b: Results that are paired with `a`.
 
     Raises:
-        DataError: No scenario in common, or an evaluation with several rows of a scenario.
+        DataError: No scenario in common, or results with several rows of a scenario.
     """
     # scored files may hold several sets of rollouts of a scenario: nothing says which of them make a pair
-    for evaluation in (a, b):
-        repeated = [scenario_id for scenario_id, count in Counter(evaluation.scenario_ids).items() if count > 1]
+    for results in (a, b):
+        repeated = [scenario_id for scenario_id, count in Counter(results.scenario_ids).items() if count > 1]
         if repeated:
             raise DataError(
-                f"{evaluation.name}: scenario {repeated[0]} has several rows, a pair needs one: score its sets apart."
+                f"{results.name}: scenario {repeated[0]} has several rows, a pair needs one: score its sets apart."
             )
-    rows_by_id = {scenario_id: row for row, scenario_id in enumerate(b.scenario_ids)}
-    rows_a = [row for row, scenario_id in enumerate(a.scenario_ids) if scenario_id in rows_by_id]
+    ids_a, ids_b = a.scenario_ids, b.scenario_ids
+    rows_by_id = {scenario_id: row for row, scenario_id in enumerate(ids_b)}
+    rows_a = [row for row, scenario_id in enumerate(ids_a) if scenario_id in rows_by_id]
     if not rows_a:
-        raise DataError(f"{a.name} ({len(a)} scenarios) and {b.name} ({len(b)}) have no scenario in common.")
-    return rows_a, [rows_by_id[a.scenario_ids[row]] for row in rows_a]
+        raise DataError(f"{a.name} ({len(ids_a)} scenarios) and {b.name} ({len(ids_b)}) have no scenario in common.")
+    return rows_a, [rows_by_id[ids_a[row]] for row in rows_a]
 
 
 def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str], np.ndarray, np.ndarray]:

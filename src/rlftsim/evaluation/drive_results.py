@@ -15,7 +15,7 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
-from rlftsim.evaluation.compare import PairedDifference, compare_paired, comparison_table
+from rlftsim.evaluation.compare import PairedDifference, compare_paired, comparison_table, pair_rows
 from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
 from rlftsim.jobs.files import write_atomically
@@ -225,11 +225,7 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
             value_a, value_b = getattr(a.settings, label), getattr(b.settings, label)
             value_b = f"another {value_b}" if value_a == value_b else value_b
             raise DataError(f"{a.name} was driven with {label} {value_a}, {b.name} with {value_b}: drive both alike.")
-    rows_by_id = {name: row for row, name in enumerate(b.scenario_ids)}
-    rows_a = [row for row, name in enumerate(a.scenario_ids) if name in rows_by_id]
-    rows_b = [rows_by_id[name] for name in a.scenario_ids if name in rows_by_id]
-    if not rows_a:
-        raise DataError(f"{a.name} and {b.name} have no scenario in common.")
+    rows_a, rows_b = pair_rows(a, b)
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
     rows = (compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
     return DriveComparison(a, b, tuple(rows))

@@ -3,36 +3,31 @@
 An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
 """
 
-import copy
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import torch
-from torch import nn
 
-from rlftsim.errors import ConfigError, DataError, whole_number
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.types import Goals, logged_goals
-from rlftsim.jobs.buckets import validate_folder
-from rlftsim.jobs.runner import Runner, choose_runner
+from rlftsim.jobs.items import group_positions, run_items
+from rlftsim.jobs.runner import Advance, Runner, check_jobs, choose_runner
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned
+from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.types import Scenario
 
 Oracle = Literal["oracle"]
-AnyPolicy = TypeVar("AnyPolicy")
 
 
 def evaluate(
@@ -73,7 +68,7 @@ def evaluate(
         raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
     # Everything that can be refused is refused before anything is simulated or written.
     dataset, config = open_held_out(data, config)
-    positions = choose_scenarios(dataset, config)
+    ids = choose_scenarios(dataset, config)
     check_jobs(config.jobs, get_device(policy))
     frozen: Policy | Oracle = frozen_copy(policy)
     if frozen != "oracle":
@@ -87,32 +82,25 @@ def evaluate(
         sources=dataset.sources,
         guessed=dataset.guessed,
     )
-    return resume_evaluation(
-        f"evaluate {name}",
-        dataset.scenario_ids[: len(positions)],
-        partial(_evaluate_scenario, frozen, dataset, config),
-        name=name,
-        provenance=provenance,
-        out=None if out is None else validate_folder(out),
-        runner=runner or choose_runner(config.jobs, math.ceil(len(positions) / ScenarioRows.items_per_file)),
-        show_progress=show_progress,
-    )
+    groups = group_positions(len(ids), ScenarioRows.items_per_file)
+    runner = runner or choose_runner(config.jobs, len(groups))
+    with claim_evaluation(name, provenance, out, ids, runner) as (rows, claim):
+        if claim.lease is not None:
+            task = partial(_evaluate_group, frozen, dataset, config, rows)
+            claim.result = rows.join(
+                run_items(
+                    f"evaluate {name}", groups, task,
+                    format=rows, lease=claim.lease, runner=runner, show_progress=show_progress,
+                )
+            )  # fmt: skip
+    assert claim.result is not None
+    return claim.result
 
 
 def evaluation_name(model: str | PathLike[str]) -> str:
     """Name of an evaluation of a model: name of the folder, or of the run for a model in RUN/model."""
     path = Path(model)
     return path.parent.name if path.name == "model" else path.name
-
-
-def frozen_copy(policy: AnyPolicy) -> AnyPolicy:
-    """A copy without dropout and gradients, so that tables of weights stay valid; the policy if without weights."""
-    return copy.deepcopy(policy).eval().requires_grad_(False) if isinstance(policy, nn.Module) else policy
-
-
-def evaluated_ends(batch: ScenarioBatch) -> Goals:
-    """Logged final positions of the evaluated agents, as goals."""
-    return logged_goals(batch, batch.evaluated_mask)
 
 
 def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
@@ -131,81 +119,34 @@ def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: Evalu
     }
 
 
-def check_jobs(jobs: int, device: torch.device, setting: str = "evaluate.jobs") -> None:
-    """Check a number of processes; a policy on a GPU is used by a single one.
-
-    Args:
-        jobs: Number of processes, at least 1.
-        device: Device of the policy; several processes need "cpu".
-        setting: Name of the setting, for messages.
-
-    Raises:
-        ConfigError: No process, or several processes and a GPU.
-    """
-    whole_number(setting, jobs, 1)
-    if jobs > 1 and device.type != "cpu":
-        raise ConfigError(
-            f"{setting}={jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
-        )
-
-
 def simulate_states(
-    policy: Policy,
-    scenario: Scenario,
-    config: EvaluateConfig,
-    device: torch.device,
-    *,
-    goals_of: Callable[[ScenarioBatch], Goals] | None = None,
+    policy: Policy, batch: ScenarioBatch, config: EvaluateConfig, *, context: Any = None, goals: Goals | None = None
 ) -> SimulatedStates:
     """All rollouts of a scenario, simulated a few at a time; a deterministic policy is simulated once.
 
     Args:
         policy: Policy of all agents.
-        scenario: Logged scenario, simulated from the current step on.
+        batch: The scenario alone, on the policy's device; simulated from the current step on.
         config: Number of rollouts, rollouts at a time, seed, sampling.
-        device: Device of the policy, for all computations.
-        goals_of: Goals of the agents of a batch, the same in all rollouts; None = goal-free.
+        context: Result of an earlier `policy.encode(batch)`; None = encode here.
+        goals: Goals of a single rollout, the same in all; None = goal-free.
 
     Raises:
         ConfigError: The policy cannot sample as `config` says, e.g. top-k without categories.
         DataError: A pose of the policy is not finite.
     """
-    batch = collate([scenario]).to(device)
-    with torch.no_grad():
-        context = policy.encode(batch)
-    return simulate_encoded(policy, batch, context, config, goals=goals_of and goals_of(batch))
-
-
-def simulate_encoded(
-    policy: Policy, batch: ScenarioBatch, context: Any, config: EvaluateConfig, *, goals: Goals | None = None
-) -> SimulatedStates:
-    """All rollouts of a scenario that the policy has encoded, see `simulate_states`.
-
-    Args:
-        policy: Policy of all agents.
-        batch: The scenario alone, on the policy's device.
-        context: Result of `policy.encode(batch)`.
-        config: Number of rollouts, rollouts at a time, seed, sampling.
-        goals: Goals of a single rollout, the same in all; None = goal-free.
-
-    Raises:
-        DataError: A pose of the policy is not finite.
-    """
+    if context is None:
+        with torch.no_grad():
+            context = policy.encode(batch)
     is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
     ids = range(config.num_rollouts if is_random else 1)
     passes = []
     for first in range(0, len(ids), config.rollouts_per_pass):
         # Noise belongs to rollout ids, so the passes together draw what a single pass would.
-        rollout_ids = ids[first : first + config.rollouts_per_pass]
         rollouts = simulate(
-            policy,
-            batch,
-            num_rollouts=rollout_ids,
-            seed=config.seed,
-            context=context,
-            sampling=config.sampling,
-            goals=goals,
-        )
+            policy, batch, num_rollouts=ids[first : first + config.rollouts_per_pass], seed=config.seed,
+            context=context, sampling=config.sampling, goals=goals,
+        )  # fmt: skip
         passes.append(states_of_rollouts(batch, rollouts)[0])
     x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
     joined = SimulatedStates(passes[0].object_id, x, y, z, heading)  # each [N, A, T]
@@ -215,29 +156,43 @@ def simulate_encoded(
     return joined if is_random else replace(joined, repeat=config.num_rollouts)
 
 
-def _evaluate_scenario(
-    policy: Policy | Oracle, dataset: ScenarioDataset, config: EvaluateConfig, position: int
-) -> dict[str, object] | Skipped:
-    """Row of a scenario, or the reason for a missing row."""
-    scenario, device = dataset[position], get_device(policy)
-    try:
-        scenario.check_consistency()
-        scenario.check_finite_arrays()
-    except DataError as error:
-        # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
-        raise DataError(
-            f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
-            "such scenarios out."
-        ) from None
-    # Without a road edge, for instance, the official metric is undefined.
-    try:
-        log = scenario_log(scenario, device)
-    except DataError as error:
-        return Skipped(scenario.scenario_id, str(error))
-    if isinstance(policy, str):
-        states = logged_states(scenario, num_rollouts=config.num_rollouts, device=device)
-    else:
-        goals_of = evaluated_ends if config.goals == "logged" else None
-        states = simulate_states(policy, scenario, config, device, goals_of=goals_of)
-    result = score(log, states, metric_by_name(config.metric))
-    return row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id))
+def _evaluate_group(
+    policy: Policy | Oracle,
+    dataset: ScenarioDataset,
+    config: EvaluateConfig,
+    rows: ScenarioRows,
+    group: range,
+    advance: Advance,
+    is_stopped: Callable[[], bool],
+) -> None:
+    """Score the scenarios of a group and write the rows, unless the work is being stopped."""
+    results, device = [], get_device(policy)
+    for position in group:
+        if is_stopped():
+            return
+        scenario = dataset[position]
+        try:
+            scenario.check_consistency()
+            scenario.check_finite_arrays()
+        except DataError as error:
+            # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
+            raise DataError(
+                f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
+                "such scenarios out."
+            ) from None
+        # Without a road edge, for instance, the official metric is undefined.
+        try:
+            log = scenario_log(scenario, device)
+        except DataError as error:
+            results.append(Skipped(scenario.scenario_id, str(error)))
+        else:
+            if isinstance(policy, str):
+                states = logged_states(scenario, num_rollouts=config.num_rollouts, device=device)
+            else:
+                batch = collate([scenario]).to(device)
+                goals = logged_goals(batch, batch.evaluated_mask) if config.goals == "logged" else None
+                states = simulate_states(policy, batch, config, goals=goals)
+            result = score(log, states, metric_by_name(config.metric))
+            results.append(row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id)))
+        advance(1)
+    rows.write(group, results)

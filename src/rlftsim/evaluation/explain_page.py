@@ -20,9 +20,7 @@ from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_
 from rlftsim.jobs.files import remove_folder, write_text
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
-from rlftsim.jobs.processes import Advance
-from rlftsim.jobs.runner import Runner, choose_runner
-from rlftsim.realism import metric_by_name
+from rlftsim.jobs.runner import Advance, Runner, choose_runner
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
 from rlftsim.viewer.chart import Chart, Curve, chart_html
@@ -64,7 +62,6 @@ def explain_rollouts(
     config: ScoreConfig = ScoreConfig(),  # noqa: B008
     *,
     runner: Runner | None = None,
-    show_progress: bool = True,
 ) -> list[Path]:
     """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
 
@@ -77,7 +74,6 @@ def explain_rollouts(
         out: Folder of the pages, made if missing.
         config: Metric, handling of missing maps and scenarios, processes.
         runner: Runner of the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
-        show_progress: False prints neither progress nor the time left.
 
     Raises:
         DataError: Rollouts or scenarios that `score_rollouts` refuses, or another driver at work on these pages.
@@ -98,7 +94,7 @@ def explain_rollouts(
     with Lease(pages / ".lock", runner, "works in") as lease:
         finished = run_items(
             "explain", list(items.items()), partial(_write_page, pages, source, config), lease=lease, runner=runner,
-            format=WholeFiles(pages, itemgetter(0), _read_page), show_progress=show_progress,
+            format=WholeFiles(pages, itemgetter(0), _read_page),
         )  # fmt: skip
         written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
         lease.remove()
@@ -134,7 +130,7 @@ def _write_page(
     html = ""
     # Without road edges there is no score to explain; scoring says so.
     if scenario is not None and (config.missing_map == "error" or has_road_edge(scenario)):
-        html = explanation_html(explain(scenario, read_states(entry), metric_by_name(config.metric)))
+        html = explanation_html(explain(scenario, read_states(entry), config.official_metric))
     write_text(folder / name, html)
     advance(1)
 

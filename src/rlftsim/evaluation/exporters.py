@@ -1,19 +1,30 @@
-"""Exporters: further files of simulated rollouts, for `rlftsim simulate --export NAME`. A package of your own adds one:
+"""Work after a simulation: outcomes of goals, pictures, and further files of `rlftsim simulate --export NAME`.
+
+A package of your own adds an exporter:
 
 [project.entry-points."rlftsim.exporters"]
 csv = "my_package:write_csv"
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rlftsim.errors import ConfigError
+import numpy as np
+from rich.table import Column, Table
+
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.explain import to_scene_motion
+from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
+from rlftsim.goals.attainment import Outcome, measure_outcome
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.realism import SimulatedStates
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.film import to_film
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 from rlftsim.viewer.page import Animation, Panel, write_page
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
@@ -29,6 +40,7 @@ EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
 """Name -> function."""
 MAX_ROLLOUTS = 8
 """Rollouts that play on a page; each adds about 50 kB."""
+PICTURE_INCHES = 7.0
 
 
 def exporter_by_name(name: str) -> Exporter:
@@ -87,3 +99,94 @@ def _animation(scenario: Scenario, states: SimulatedStates) -> Animation:
         Panel("rollouts", to_scene_motion(scenario, states).first(MAX_ROLLOUTS).with_overlaps(scene.agents)),
     ]
     return Animation(f"Scenario {scenario.scenario_id}", scene, panels)
+
+
+def report_rollouts(
+    folder: Path,
+    dataset: ScenarioDataset,
+    scenario_ids: Sequence[str],
+    goals: GoalsFile,
+    *,
+    picture: bool,
+    exporters: Sequence[Exporter],
+) -> None:
+    """Print a table of goals and outcomes, draw scenarios, and export scenarios.
+
+    Args:
+        folder: Folder of rollouts of `rlftsim simulate`.
+        dataset: Data set of the simulated scenarios.
+        scenario_ids: Ids of the simulated scenarios.
+        goals: Goals of the simulated agents; may be empty.
+        picture: True draws FOLDER/SCENARIO.png.
+        exporters: Functions that write further files of each scenario.
+
+    Raises:
+        DataError: Damaged rollouts.
+    """
+    outcomes, pictures = [], []
+    for scenario_id in scenario_ids:
+        entries = goals.of_scenario(scenario_id)
+        if not (entries or picture):
+            continue
+        scenario = dataset.by_id(scenario_id)
+        states = _read_rollouts(folder, scenario)
+        outcomes += [
+            (entry, measure_outcome(states.simulated_path(entry.agent_id), (entry.x, entry.y))) for entry in entries
+        ]
+        if picture:
+            pictures.append(folder / f"{scenario_id}.png")
+            draw_goals(pictures[-1], [_draw_outcome(states, scenario, entries)], panel_inches=PICTURE_INCHES)
+    if outcomes:
+        print_wide(_outcome_table(outcomes))
+    for path in pictures:
+        print_line(path)
+    for scenario in map(dataset.by_id, scenario_ids if exporters else ()):
+        states = _read_rollouts(folder, scenario)
+        for write in exporters:
+            print_line(write(scenario, states, folder))
+
+
+def _read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:
+    """Rollouts of a scenario in a folder that `rlftsim simulate` wrote.
+
+    Raises:
+        DataError: Damaged file, or one without the agents of the scenario.
+    """
+    # Files of an earlier call may be damaged or of an older data set.
+    entry = RolloutEntry(scenario.scenario_id, folder / f"{scenario.scenario_id}.npz", "npz")
+    way_out = "remove it, then run the same command again."
+    try:
+        states = read_states(entry)
+    except DataError as error:
+        raise DataError(f"{str(error).rstrip('.')}: {way_out}") from None
+    if not np.isin(scenario.tracks.object_id[scenario.simulated_indices], states.object_id).all():
+        raise DataError(f"{entry}: lacks agents of the scenario: {way_out}")
+    return states
+
+
+def _outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
+    """Table of goals and outcomes, for `print_wide`."""
+    headings = ("scenario", "agent", "label", "reached", "passed", "closest [m]: best", "median")
+    table = Table(
+        *(Column(heading, overflow="fold") for heading in headings),
+        title="goals: within 2 m in the end (reached), at any time (passed)",
+        caption="closest: smallest distance to the goal, in the best rollout and in the median one",
+        title_justify="left",
+        caption_justify="left",
+    )
+    for entry, o in outcomes:
+        numbers = (f"{o.reached:.0%}", f"{o.passed:.0%}", f"{o.best_m:.1f}", f"{o.median_m:.1f}")
+        table.add_row(entry.scenario_id, str(entry.agent_id), entry.label, *numbers)
+    return table
+
+
+def _draw_outcome(states: SimulatedStates, scenario: Scenario, entries: Sequence[GoalEntry]) -> GoalPanel:
+    """Goals and the simulated paths of their agents; without goals the paths of the evaluated agents."""
+    targeted = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
+    # Without goals the picture shows the agents that the metric evaluates.
+    free = [(agent, None, "") for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist()]
+    marks = tuple(
+        DrawnGoal(agent_id, position, label, driven=states.simulated_path(agent_id).numpy().astype(np.float64))
+        for agent_id, position, label in targeted or free
+    )
+    return GoalPanel(scenario.scenario_id, scenario, marks)

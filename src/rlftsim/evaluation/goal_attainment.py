@@ -14,14 +14,15 @@ from typing import Any
 import torch
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import check_jobs, describe_measurement, frozen_copy, simulate_encoded
+from rlftsim.evaluation.evaluate import describe_measurement, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned
+from rlftsim.jobs.runner import check_jobs
+from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 
@@ -121,7 +122,7 @@ def _simulate_goals(
     batch = collate([dataset.by_id(scenario_id)]).to(get_device(policy))
     with torch.no_grad():
         context = policy.encode(batch)
-    simulate = partial(simulate_encoded, policy, batch, context, config)
+    simulate = partial(simulate_states, policy, batch, config, context=context)
     # Without goal conditioning the rollouts are the same for every goal.
     goal_free = None if is_goal_conditioned(policy) else simulate()
     outcomes = []

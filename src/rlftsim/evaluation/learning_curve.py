@@ -1,12 +1,13 @@
-"""The metrics of a training run as charts, and as a picture in the run folder."""
+"""Pictures of training runs: metrics as charts, and what each feature of a calibration earns."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rlftsim.policies.calibrated.policy import CALIBRATION, read_calibration
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.viewer.chart import Chart, Curve
-from rlftsim.viewer.figure import charts_to_png
+from rlftsim.viewer.figure import Interval, charts_to_png, draw_intervals, save_figure
 
 Lines = Sequence[Mapping[str, Any]]
 """Values of each update, see `read_metrics`."""
@@ -83,3 +84,32 @@ def _chart(lines: Lines, title: str, label: str, *, reference: tuple[str, float]
 def _curve(lines: Lines, key: str, name: str | None = None) -> Curve:
     logged = [line for line in lines if key in line]
     return Curve(name or key, [line["update"] for line in logged], [line[key] for line in logged])
+
+
+def write_calibration_picture(model: Path) -> Path | None:
+    """Draw `calibration.png` into a model folder: the RMM that each feature earns, with its 95 % interval.
+
+    Args:
+        model: Folder of a calibrated policy.
+
+    Returns:
+        The picture; None if the folder holds no calibration.
+    """
+    path = model / CALIBRATION
+    if not path.exists():
+        return None
+    rows = sorted(read_calibration(path)["features"], key=lambda row: -row["rmm"])
+    intervals = []
+    for row in rows:
+        half = 1.96 * abs(row["rmm"] / row["t"]) if row["t"] else 0.0
+        intervals.append(
+            Interval(f"{row['feature']}  {row['eta']:+.2f}", row["rmm"], row["rmm"] - half, row["rmm"] + half)
+        )
+    figure = draw_intervals(
+        intervals,
+        title="What each feature earns",
+        x_label="RMM, predicted to first order; beside the names eta",
+        zero=True,
+    )
+    save_figure(model / "calibration.png", figure)
+    return model / "calibration.png"

@@ -1,7 +1,7 @@
 """Interruptible measurements of many scenarios: finished groups are stored in files, a later call does the others.
 
 Evaluations and scores of rollout files are stored as `ScenarioRows` (Parquet), goal attainment, reward variances and
-planners as `ScenarioValues` (JSON). `finish_result` joins the groups in the file of the result.
+planners as `ScenarioValues` (JSON). A `Claim` is the right to join the groups in the file of a result.
 """
 
 import json
@@ -9,17 +9,19 @@ import re
 import tempfile
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import pyarrow as pa
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
+from rlftsim.jobs.buckets import validate_folder
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import check_result_file, remove_folder, remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
@@ -167,6 +169,10 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         # counted: a scenario may have several sets of rollouts in files, and one by a policy
         return stored if counts == Counter(scenario_ids) else None
 
+    def join(self, groups: list[Evaluation]) -> Evaluation:
+        """The evaluation of the scenarios of all groups."""
+        return join_evaluations(self.name, self.provenance, groups)
+
     def file_names(self, scenario_ids: Collection[str]) -> list[str]:
         """Names of groups of any size, see `ScenarioFormat`."""
         return [path.name for path in self.folder.glob("*.parquet") if _GROUP_NAME.fullmatch(path.stem)]
@@ -184,53 +190,6 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
 def _count_scenarios(evaluation: Evaluation) -> Counter[str]:
     """Number of rows of each scenario of an evaluation, scenarios without scores included."""
     return Counter([*evaluation.scenario_ids, *(skipped.scenario_id for skipped in evaluation.skipped)])
-
-
-def resume_evaluation(
-    title: str,
-    scenario_ids: Sequence[str],
-    work: Callable[[int], Mapping[str, object] | Skipped],
-    *,
-    name: str,
-    provenance: Provenance,
-    out: Path | None,
-    runner: Runner,
-    show_progress: bool = True,
-) -> Evaluation:
-    """The evaluation `out/<name>.parquet`: read, or made by the work on all missing scenarios.
-
-    Args:
-        title: Name of the work, in front of the progress bar.
-        scenario_ids: Ids of all scenarios of the evaluation, in the order of the rows.
-        work: Function from the position of a scenario to a row of `SCHEMA`, or to the reason for a missing row.
-        name: Name of the evaluation and of the file.
-        provenance: Values that a stored result must agree with, else the call ends with an error.
-        out: Folder of the result; None stores no file.
-        runner: Runner of the groups that are missing; changes no result.
-        show_progress: False prints neither progress nor the time left.
-
-    Raises:
-        ConfigError: A name that no file can have, a stored result of other work, a limit that would leave out stored
-            scenarios, or shares without a folder to meet in.
-        DataError: A second driver at work on this evaluation.
-        SetAside, Unfinished: See `run_items`.
-    """
-    if out is None and isinstance(runner, Share | Joining):
-        raise ConfigError("shares meet in a folder: name one with --out.")
-    # Processes hand their rows over in files, so even a result that is not kept needs a folder.
-    with tempfile.TemporaryDirectory() as temporary_folder:
-        rows = ScenarioRows(name, provenance, out or Path(temporary_folder))
-        return finish_result(
-            title,
-            scenario_ids,
-            work,
-            path=rows.result_path,
-            format=rows,
-            find=partial(rows.read_finished, scenario_ids),
-            combine=partial(join_evaluations, name, provenance),
-            runner=runner,
-            show_progress=show_progress,
-        )
 
 
 def measure_scenarios(
@@ -254,12 +213,36 @@ def measure_scenarios(
         NotYetError: A second process at work in the folder.
         SetAside: See `run_items`.
     """
-    groups = group_positions(len(format.scenario_ids), format.items_per_file)
-    runner, task = choose_runner(jobs, len(groups)), group_task(work, format)
+    runner = choose_runner(jobs, len(format.scenario_ids))
     with Lease(format.folder / ".lock", runner, "works in") as lease:
-        stored = run_items(title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress)
+        stored = run_groups(title, format.scenario_ids, work, format, lease, runner, show_progress=show_progress)
         lease.remove()
     return stored
+
+
+def run_groups(
+    title: str,
+    scenario_ids: Sequence[str],
+    work: Callable[[int], Result],
+    format: ScenarioFormat[Stored, Result],
+    lease: Lease,
+    runner: Runner,
+    *,
+    show_progress: bool = True,
+) -> list[Stored]:
+    """Stored results of the groups of scenarios, done now where they are missing, see `run_items`.
+
+    Args:
+        title: Name of the work, in front of the progress bar.
+        scenario_ids: Ids of all scenarios, in the order of the groups.
+        work: Function from the position of a scenario to the result of the scenario.
+        format: Files of the groups.
+        lease: Lock on the folder of the files.
+        runner: Runner of the groups that are missing; changes no result.
+        show_progress: False prints neither progress nor the time left.
+    """
+    groups, task = group_positions(len(scenario_ids), format.items_per_file), group_task(work, format)
+    return run_items(title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress)
 
 
 @runtime_checkable
@@ -274,55 +257,83 @@ class Writable(Protocol):
 FinishedResult = TypeVar("FinishedResult", bound=Writable)
 
 
-def finish_result(
-    title: str,
-    scenario_ids: Sequence[str],
-    work: Callable[[int], Result],
-    *,
+@dataclass(eq=False)
+class Claim(Generic[FinishedResult]):
+    """The right to make a result, or the result that an earlier call has finished."""
+
+    result: FinishedResult | None
+    """None until the missing result is made."""
+    lease: Lease | None
+    """Lock on the folder of the groups; None where the result is finished."""
+
+
+@contextmanager
+def claim_result(
     path: Path,
-    format: ScenarioFormat[Stored, Result],
+    format: ScenarioFormat[Any, Any],
+    scenario_ids: Sequence[str],
     find: Callable[[], FinishedResult | None],
-    combine: Callable[[list[Stored]], FinishedResult],
     runner: Runner,
-    show_progress: bool = True,
-) -> FinishedResult:
-    """The result that an earlier call finished, or a new result, written to the file.
+) -> Iterator[Claim[FinishedResult]]:
+    """Hold the right to make a result for the time of a block, after which the new result is written.
 
     Args:
-        title: Name of the work, in front of the progress bar.
-        scenario_ids: Ids of all scenarios of the result.
-        work: Function from the position of a scenario to the result of the scenario.
         path: File of the result.
         format: Files of finished groups, removed in the end. All stay if a longer run is unfinished in the folder: with
             further groups, or with lock files of shares while `runner` is no share.
+        scenario_ids: Ids of all scenarios of the result.
         find: Reader of the finished result; returns None for a missing result.
-        combine: Maker of the result from all groups, in the order of the scenarios.
         runner: Runner of the groups that are missing; changes no result.
-        show_progress: False prints neither progress nor the time left.
 
     Raises:
         DataError: A second driver at work on this result.
     """
     check_folder(path.parent, "results")
-    stamp, result = _stamp(path), find()
-    if result is None:
-        with Lease(format.folder / ".lock", runner, "works in") as lease:
-            # another driver may have finished since, so what would be replaced is looked at again
-            result = find() if _stamp(path) != stamp else None
-            if result is None:
-                groups, task = group_positions(len(scenario_ids), format.items_per_file), group_task(work, format)
-                stored = run_items(
-                    title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress
-                )
-                result = combine(stored)
-                remove_temporaries([path])
-                result.write(path)
-            # Only now: an interruption between the two leaves the groups, and the next call finds the result.
-            _remove_groups(format, scenario_ids, runner)
-    elif format.folder.exists():
-        with suppress(DataError), Lease(format.folder / ".lock", Inline(), "works in"):
-            _remove_groups(format, scenario_ids, runner)
-    return result
+    stamp, stored = _stamp(path), find()
+    if stored is not None:
+        yield Claim(stored, None)
+        if format.folder.exists():
+            with suppress(DataError), Lease(format.folder / ".lock", Inline(), "works in"):
+                _remove_groups(format, scenario_ids, runner)
+        return
+    with Lease(format.folder / ".lock", runner, "works in") as lease:
+        # another driver may have finished since, so what would be replaced is looked at again
+        stored = find() if _stamp(path) != stamp else None
+        claim = Claim(stored, lease if stored is None else None)
+        yield claim
+        if claim.lease is not None and claim.result is not None:
+            remove_temporaries([path])
+            claim.result.write(path)
+        # Only now: an interruption between the two leaves the groups, and the next call finds the result.
+        _remove_groups(format, scenario_ids, runner)
+
+
+@contextmanager
+def claim_evaluation(
+    name: str, provenance: Provenance, out: str | PathLike[str] | None, scenario_ids: Sequence[str], runner: Runner
+) -> Iterator[tuple[ScenarioRows, Claim[Evaluation]]]:
+    """Hold the right to make the evaluation `out/<name>.parquet`; yields the files of groups, too.
+
+    Args:
+        name: Name of the evaluation and of the file.
+        provenance: Values that a stored result must agree with, else the call ends with an error.
+        out: Folder of the result; None stores no file.
+        scenario_ids: Ids of all scenarios of the evaluation, in the order of the rows.
+        runner: Runner of the groups that are missing; changes no result.
+
+    Raises:
+        ConfigError: A name that no file can have, a stored result of other work, a limit that would leave out stored
+            scenarios, or shares without a folder to meet in.
+        DataError: A second driver at work on this evaluation.
+    """
+    if out is None and isinstance(runner, Share | Joining):
+        raise ConfigError("shares meet in a folder: name one with --out.")
+    # Processes hand their rows over in files, so even a result that is not kept needs a folder.
+    with tempfile.TemporaryDirectory() as temporary_folder:
+        rows = ScenarioRows(name, provenance, validate_folder(temporary_folder if out is None else out))
+        find = partial(rows.read_finished, scenario_ids)
+        with claim_result(rows.result_path, rows, scenario_ids, find, runner) as claim:
+            yield rows, claim
 
 
 def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:

@@ -18,14 +18,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.evaluate import check_jobs, describe_measurement, frozen_copy, simulate_states
+from rlftsim.evaluation.evaluate import describe_measurement, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
+from rlftsim.jobs.runner import check_jobs
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.realism import compute_mloo
-from rlftsim.rollout.policy import Policy, get_device
+from rlftsim.rollout.policy import Policy, frozen_copy, get_device
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -76,7 +78,7 @@ def measure_variances(
             f"got {config.num_rollouts}: set --num-rollouts 32."
         )
     check_jobs(config.jobs, get_device(policy))
-    ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
+    ids = choose_scenarios(dataset, config)
     identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
     stored = measure_scenarios(
         "variances",
@@ -136,7 +138,7 @@ def _measure_scenario(
     except DataError as error:
         return {"variances": [], "skipped": str(error)}
     # features once for all rollouts: subsets pick rows of them, which is what training would compute
-    features = compute_features(log, simulate_states(policy, scenario, config, device))
+    features = compute_features(log, simulate_states(policy, collate([scenario]).to(device), config))
     score_subset = partial(_score_subset, log, features, config.metric)
     # by scenario: neither the order of the scenarios nor the number of processes changes the subsets
     rng = np.random.default_rng([config.seed, *scenario.scenario_id.encode()])

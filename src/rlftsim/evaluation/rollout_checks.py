@@ -85,8 +85,8 @@ class PoseChecks:
     @np.errstate(over="ignore")  # infinitely far is far
     def first_step_errors(self) -> Float32[np.ndarray, "N A"]:
         """Meters from each agent's first position to that of constant velocity, or to the current one if nearer."""
-        first, now = self.poses[:, :, :2, 0], self.position[:, :2]
-        moved, expected = first - now, np.float32(STEP_S) * self.velocity
+        first, start = self.poses[:, :, :2, 0], self.position[:, :2]
+        moved, expected = first - start, np.float32(STEP_S) * self.velocity
         error = np.sqrt(np.minimum(*(np.square(v).sum(-1) for v in (moved, moved - expected))))  # [N, A]
         return error * self.is_judged[:, 0]
 
@@ -113,10 +113,10 @@ class PoseChecks:
             return
         x, y, z, turned = (poses[:, :, axis] for axis in range(4))  # each [N, A, T]
         from_start = _square(x - start[:, 0, None], y - start[:, 1, None])
-        far = _largest(from_start * is_judged).root
-        if far.value > MAX_DISTANCE_M:
-            text = f"{far.value:.0f} m from its current position, beyond {MAX_DISTANCE_M:.0f} m,"
-            yield self._doubt("distance", text, far, is_impossible=True)
+        farthest = _largest(from_start * is_judged).root
+        if farthest.value > MAX_DISTANCE_M:
+            text = f"{farthest.value:.0f} m from its current position, beyond {MAX_DISTANCE_M:.0f} m,"
+            yield self._doubt("distance", text, farthest, is_impossible=True)
         moved = _square(x[..., 1:] - x[..., :-1], y[..., 1:] - y[..., :-1])
         step = _largest(moved * (is_judged[:, 1:] & is_judged[:, :-1])).root
         if step.value > DOUBTFUL_STEP_M:
@@ -125,8 +125,8 @@ class PoseChecks:
         largest = _largest(np.abs(turned) * is_judged)
         # Either all within a turn, where a step through pi jumps by a turn, or turned continuously.
         is_wrapped = (np.abs(turned) <= math.pi + 1e-4).all(-1, keepdims=True)  # [N, A, 1]
-        before = np.broadcast_to(self.heading[:, None], (*turned.shape[:2], 1))
-        change = _largest(np.abs(np.diff(turned, prepend=before)) * (is_judged & ~is_wrapped))
+        current_heading = np.broadcast_to(self.heading[:, None], (*turned.shape[:2], 1))
+        change = _largest(np.abs(np.diff(turned, prepend=current_heading)) * (is_judged & ~is_wrapped))
         if largest.value > MAX_HEADING_RAD:
             yield self._doubt("heading", f"heading of {largest.value:.0f} rad (degrees?)", largest)
         else:

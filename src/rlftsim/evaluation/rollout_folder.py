@@ -13,16 +13,13 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.goals.goals_file import GoalsFile
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
-from rlftsim.jobs.processes import Advance
-from rlftsim.jobs.runner import Runner
-from rlftsim.realism import SimulatedStates
+from rlftsim.jobs.runner import Advance, Runner
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, get_device
-from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -36,18 +33,22 @@ class Simulation:
     """Input of a simulation; is handed to worker processes."""
 
     policy: Policy
-    scenarios: ScenarioDataset
+    dataset: ScenarioDataset
+    scenario_ids: Sequence[str]
+    """In the order of the work."""
     num_rollouts: int
-    seed: int = 0
-    sampling: Sampling = Sampling()  # noqa: RUF009 (frozen)
-    goals: GoalsFile = GoalsFile(())  # noqa: RUF009 (frozen)
+    seed: int
+    sampling: Sampling
+    goals: GoalsFile
+    model: str
+    """Name of the model, for people who read the description."""
 
-    def describe(self, model: str) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Values on which the rollouts depend, in types of JSON, and the name of the model, which may change."""
         identity = {
-            "model": model,
+            "model": self.model,
             "policy": fingerprint_policy(self.policy),
-            "data": self.scenarios.fingerprint,
+            "data": self.dataset.fingerprint,
             "seed": self.seed,
             "num_rollouts": self.num_rollouts,
             "sampling": asdict(self.sampling),
@@ -56,26 +57,23 @@ class Simulation:
         return identity | ({"goals": entries} if entries else {})
 
 
-def simulate_folder(
-    simulation: Simulation, scenario_ids: Sequence[str], out: Path, *, model: str, runner: Runner
-) -> list[Path]:
+def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> list[Path]:
     """Simulate the scenarios that have no complete file yet; returns the files of all.
 
     Args:
-        simulation: Policy, data and settings, which must be those of the rollouts that are in the folder.
-        scenario_ids: Ids of the scenarios, in the order of the work.
+        simulation: Policy, scenarios and settings, which must be those of the rollouts that are in the folder.
         out: Folder of the files `<scenario id>.npz` and of the description, made if missing.
-        model: Name of the model, for people who read the description.
         runner: Runner of the work; changes no result.
 
     Raises:
-        ConfigError: A folder of rollouts of a second model or other settings.
+        ConfigError: A folder of rollouts of a second model or other settings, or a policy that cannot sample so.
         DataError: A damaged description, or a folder of a different type of result.
         NotYetError: A second driver at work in the folder.
         SetAside, Unfinished: See `run_items`.
     """
-    identity = simulation.describe(model)
-    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_read_rollouts, simulation.num_rollouts))
+    check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
+    identity = simulation.describe()
+    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_validate_file, simulation.num_rollouts))
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
@@ -83,22 +81,22 @@ def simulate_folder(
         write_identity(out / ABOUT, identity)
         _check_identity(out, identity, is_alone=lease.is_alone)  # another share may have begun at the same moment
         task = partial(_simulate_scenario, simulation, out)
-        paths = run_items("simulate", scenario_ids, task, format=rollouts, lease=lease, runner=runner)
+        paths = run_items("simulate", simulation.scenario_ids, task, format=rollouts, lease=lease, runner=runner)
         remove_temporaries([out / ABOUT, *paths])  # of processes that were killed
         lease.remove()
     return paths
 
 
-def _read_rollouts(num_rollouts: int, path: Path) -> SimulatedStates:
-    """Rollouts of the scenario that the file is named after; checksums, types and shapes of the arrays are right.
+def _validate_file(num_rollouts: int, path: Path) -> Path:
+    """The file of a scenario; checksums, types and shapes of its arrays are right.
 
     Raises:
-        DataError: Damaged file, or other rollouts.
+        DataError: Damaged file, or other rollouts than those of the scenario that the file is named after.
     """
     states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == path.stem]
     if [len(rollouts.x) for rollouts in states] != [num_rollouts]:
         raise DataError(f"{path}: it holds other rollouts than {num_rollouts} of its scenario.")
-    return states[0]
+    return path
 
 
 def _simulate_scenario(
@@ -107,7 +105,7 @@ def _simulate_scenario(
     """File with the rollouts of a scenario, written now; None where the work is being stopped."""
     if is_stopped():
         return None
-    batch = collate([simulation.scenarios.by_id(scenario_id)]).to(get_device(simulation.policy))
+    batch = collate([simulation.dataset.by_id(scenario_id)]).to(get_device(simulation.policy))
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
@@ -135,7 +133,8 @@ def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool
     way_out = "name another --out"
     if rollouts and not path.exists():
         raise ConfigError(f"{folder} holds {rollouts[0].name} but no {ABOUT}, so their model is unknown: {way_out}.")
-    differences = [name for name in find_differences(path, identity, way_out) if name != "model"]
+    differences = find_differences(path, identity, way_out)
+    model = differences.pop("model", identity["model"])
     if differences and (rollouts or not is_alone):
-        begun, model = "holds" if rollouts else "was begun by a share for", read_json(path, way_out).get("model")
+        begun = "holds" if rollouts else "was begun by a share for"
         raise ConfigError(f"{folder} {begun} rollouts of {model} with another {', '.join(differences)}: {way_out}.")

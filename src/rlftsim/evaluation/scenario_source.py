@@ -38,8 +38,8 @@ def open_held_out(
     return ScenarioDataset(folder, config.split, cache_size=_CACHED_SCENARIOS), config
 
 
-def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
-    """Positions of the scenarios to evaluate: all, or the first up to the limit.
+def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> list[str]:
+    """Ids of the scenarios to evaluate: all, or the first up to the limit.
 
     Args:
         dataset: Scenarios of the split.
@@ -60,7 +60,7 @@ def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
             f"{dataset.scenario_ids[short[0]]} with {steps[short[0]]} steps: a test split can be simulated but not "
             "evaluated, use training or validation data."
         )
-    return positions
+    return dataset.scenario_ids[: len(positions)]
 
 
 def hash_manifest(folder: Path) -> str:

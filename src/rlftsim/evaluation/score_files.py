@@ -19,7 +19,7 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation, run_groups
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
@@ -55,7 +55,12 @@ class ScoreConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ConfigError(f"score.{name} must be at least 1, got {value}.")
-        metric_by_name(self.metric)
+        _ = self.official_metric
+
+    @property
+    def official_metric(self) -> MetricConfig:
+        """Configuration of the metric's year."""
+        return metric_by_name(self.metric)
 
     @property
     def num_jobs(self) -> int:
@@ -115,19 +120,17 @@ def score_rollouts(
         guessed=source.guessed,
     )
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
-    result = resume_evaluation(
-        f"score {name}",
-        [entry.scenario_id for entry in entries],
-        partial(_score_entry, tuple(entries), source, config, num_rollouts),
-        name=name,
-        provenance=provenance,
-        out=None if out is None else Path(out),
-        runner=runner or choose_runner(config.num_jobs, math.ceil(len(entries) / ScenarioRows.items_per_file)),
-        show_progress=show_progress,
-    )
+    ids, work = [entry.scenario_id for entry in entries], partial(_score_entry, entries, source, config, num_rollouts)
+    runner = runner or choose_runner(config.num_jobs, math.ceil(len(entries) / ScenarioRows.items_per_file))
+    with claim_evaluation(name, provenance, out, ids, runner) as (rows, claim):
+        if claim.lease is not None:
+            claim.result = rows.join(
+                run_groups(f"score {name}", ids, work, rows, claim.lease, runner, show_progress=show_progress)
+            )
+    assert claim.result is not None
     # The result may be a stored one, made under missing_map="skip".
-    _check_maps(result.skipped, config)
-    return result
+    _check_maps(claim.result.skipped, config)
+    return claim.result
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
@@ -229,7 +232,7 @@ def _score_entry(
             "number, so a mean over both means nothing. Score them apart."
         )
     try:
-        result = score(scenario_log(scenario), states, metric_by_name(config.metric))
+        result = score(scenario_log(scenario), states, config.official_metric)
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
     warn_of_doubts(scenario, states, entry.file)

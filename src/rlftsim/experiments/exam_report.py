@@ -8,11 +8,9 @@ from typing import Any
 
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, find_direction
 from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
-from rlftsim.experiments import tables
-from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Margin
-from rlftsim.experiments.ledger import Ledger
+from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Ledger, Margin
 from rlftsim.experiments.results import format_origin, to_finite
-from rlftsim.experiments.tables import TextTable
+from rlftsim.experiments.tables import TextTable, build_table
 from rlftsim.jobs.files import write_text
 from rlftsim.training.run_folder import describe_environment, to_plain
 
@@ -35,7 +33,7 @@ def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[
         Tables and verdicts.
     """
     environment = describe_environment()
-    means_table = tables.build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
+    means_table = build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
     all_tables = (means_table, build_changes_table(result), build_margins_table(result))
     lines = [row.verdict for row in result.rows] + [format_next_run(row) for row in result.rows if len(row.by_run) > 1]
     lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")

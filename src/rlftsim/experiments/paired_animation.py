@@ -44,9 +44,9 @@ def animate_pair(
         prefers_increase: True takes the rollout of the largest increase, False that of the largest decrease.
     """
     device = find_device(suite.device)
-    log = scenario_log(scenario, device)
+    log, batch = scenario_log(scenario, device), collate([scenario]).to(device)
     features = {
-        name: compute_features(log, simulate_states(policy, scenario, suite.evaluation, device))
+        name: compute_features(log, simulate_states(policy, batch, suite.evaluation))
         for name, policy in policies.items()
     }
     # Events: evaluated agents that collide at some step, plus those that leave the road at some step.
@@ -56,7 +56,7 @@ def animate_pair(
     )
     rollout = int(((tuned - base) * (1 if prefers_increase else -1)).argmax())
     # Noise depends on the number of the rollout alone, so that simulating this one alone repeats it.
-    rollout_ids, batch = range(rollout, rollout + 1), collate([scenario]).to(device)
+    rollout_ids = range(rollout, rollout + 1)
     seed, sampling = suite.evaluation.seed, suite.evaluation.sampling
     panels = []
     for name, policy in policies.items():

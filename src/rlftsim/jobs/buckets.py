@@ -16,14 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
-from rlftsim.jobs.files import (
-    NO_ROOM,
-    errors_name,
-    remove_temporaries,
-    temporary_path,
-    write_atomically,
-    write_text,
-)
+from rlftsim.jobs.files import NO_ROOM, errors_name, remove_temporaries, temporary_path, write_atomically, write_text
 from rlftsim.jobs.folder import describe_owner, parse_owner
 from rlftsim.jobs.progress import log
 

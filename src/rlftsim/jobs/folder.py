@@ -122,8 +122,8 @@ def _find_holder(folder: Path) -> str | None:
     return None
 
 
-def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> list[str]:
-    """Names of the values by which stored results differ from this work; empty where no identity is stored.
+def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> dict[str, Any]:
+    """Stored values by which results differ from this work, by name; empty where no identity is stored.
 
     Args:
         path: JSON file that `write_identity` has written.
@@ -135,7 +135,7 @@ def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> li
     """
     check_result_file(path)
     stored = read_json(path, remedy) if path.exists() else identity
-    return [name for name in {**identity, **stored} if stored.get(name) != identity.get(name)]
+    return {name: stored.get(name) for name in {**identity, **stored} if stored.get(name) != identity.get(name)}
 
 
 def write_identity(path: Path, identity: Mapping[str, Any]) -> None:

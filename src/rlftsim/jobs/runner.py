@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from rlftsim.errors import ConfigError, NotYetError, RlftsimError
+from rlftsim.errors import ConfigError, NotYetError, RlftsimError, whole_number
 from rlftsim.jobs.processes import Advance, OnDeath, Processes, Task, check_log, log_item
 
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
@@ -64,6 +64,24 @@ def usable_cores() -> int:
     except (OSError, ValueError):
         return cores
     return min(cores, max(math.ceil(quota / period), 1))
+
+
+def check_jobs(jobs: int, device: Any, setting: str = "evaluate.jobs") -> None:
+    """Check a number of processes; a policy on a GPU is used by a single one.
+
+    Args:
+        jobs: Number of processes, at least 1.
+        device: Device of the policy; several processes need "cpu".
+        setting: Name of the setting, for messages.
+
+    Raises:
+        ConfigError: No process, or several processes and a GPU.
+    """
+    whole_number(setting, jobs, 1)
+    if jobs > 1 and device.type != "cpu":
+        raise ConfigError(
+            f"{setting}={jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
+        )
 
 
 @dataclass(frozen=True)

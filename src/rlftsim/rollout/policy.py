@@ -37,11 +37,12 @@ between rollout and score.
 Shapes: B scenarios, N rollouts, A agents, L decisions, t steps of 0.1 s per decision, V tokens, R selected elements.
 """
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -52,6 +53,8 @@ from rlftsim.goals.types import Goals
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.vocabulary import Vocabulary
+
+AnyPolicy = TypeVar("AnyPolicy")
 
 
 @dataclass(frozen=True)
@@ -495,6 +498,11 @@ def get_device(policy: object) -> torch.device:
     """Device of a policy's weights; the CPU for a policy without any."""
     weights = policy.parameters() if isinstance(policy, nn.Module) else ()
     return next((w.device for w in weights), torch.device("cpu"))
+
+
+def frozen_copy(policy: AnyPolicy) -> AnyPolicy:
+    """A copy without dropout and gradients, so that tables of weights stay valid; the policy if without weights."""
+    return copy.deepcopy(policy).eval().requires_grad_(False) if isinstance(policy, nn.Module) else policy
 
 
 def is_training(policy: object) -> bool:

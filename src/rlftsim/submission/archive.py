@@ -2,10 +2,12 @@
 
 Each packed shard is the tar entry of a file (header, contents, padding), deflated alone and ended by a full flush, so
 that packed shards can be concatenated. Together with an end block the result is a single gzip member. (Whole gzip
-members may be concatenated, too, but Python's tarfile in mode "r|gz" reads the first only.)
+members may be concatenated, too, but Python's tarfile in mode "r|gz" reads the first only.) `split_file` cuts a large
+archive into parts for transport; the upload page takes the joined file.
 """
 
 import hashlib
+import math
 import os
 import shutil
 import struct
@@ -13,16 +15,18 @@ import tarfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from glob import escape
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
-from rlftsim.errors import DataError
-from rlftsim.jobs.files import errors_name, write_atomically
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_path, write_atomically
 
 LEVEL = 1
 """Of deflate. On rollouts 6 and 9 save less than 1 % and take twice as long."""
 _CHUNK = 1 << 18
+_COPIED = 1 << 22
 MAX_EXPANSION, LEAST_UNPACKED = 200, 1 << 28
 """Most bytes that a packed byte stands for, in archives of more than so many bytes: sampled rollouts have 2."""
 _GZIP_HEADER = b"\x1f\x8b\x08\x00" + bytes(4) + b"\x04\xff"  # deflate, no name, no time, fastest, unknown system
@@ -255,3 +259,41 @@ class GzipReader:
         self._sha256.update(chunk)
         self.packed_size += len(chunk)
         return chunk
+
+
+def split_file(path: Path, part_gb: float) -> list[Path]:
+    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins the parts.
+
+    Parts of an earlier cut are removed when all new parts are written.
+
+    Args:
+        path: File that is copied, and stays.
+        part_gb: Size of a part in gigabytes of 10^9 bytes.
+
+    Raises:
+        ConfigError: More than 1000 parts.
+        DataError: A part cannot be written; parts of an earlier cut are left unchanged.
+    """
+    part_bytes = int(part_gb * 1e9) if 0 < part_gb < math.inf else 0
+    count = -(-path.stat().st_size // part_bytes) if part_bytes else 0
+    if not 0 < count <= 1000:
+        raise ConfigError(f"{path} cannot be cut into parts of {part_gb:g} GB: choose 1 to 1000 parts.")
+    paths = [path.with_name(f"{path.name}.{number:03d}") for number in range(count)]
+    try:
+        with path.open("rb") as source:
+            for target in paths:
+                with errors_name(target), temporary_path(target).open("wb") as out:
+                    left = part_bytes
+                    while left and (chunk := source.read(min(left, _COPIED))):
+                        out.write(chunk)
+                        left -= len(chunk)
+                    out.flush()
+                    os.fsync(out.fileno())
+        for old in path.parent.glob(f"{escape(path.name)}.[0-9][0-9][0-9]"):
+            old.unlink()  # `cat` would join those of an earlier, finer cut, too
+        for target in paths:
+            temporary_path(target).replace(target)
+    finally:
+        for target in paths:
+            remove_temporaries([target])
+    return paths

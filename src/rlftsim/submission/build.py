@@ -16,63 +16,22 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, DataError, check_types
-from rlftsim.evaluation.evaluate import check_jobs, simulate_states
-from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import (
-    errors_name,
-    remove_folder,
-    remove_temporaries,
-    temporary_path,
-    write_text,
-)
+from rlftsim.errors import DataError
+from rlftsim.evaluation.evaluate import simulate_states
+from rlftsim.jobs.files import errors_name, remove_folder, remove_temporaries, temporary_path, write_text
 from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.items import ResultFormat, run_items
-from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import Runner, choose_runner, select_items
-from rlftsim.rollout.policy import Policy, get_device
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.types import Scenario
+from rlftsim.jobs.runner import Advance, Runner, check_jobs, choose_runner, select_items
+from rlftsim.rollout.policy import get_device
+from rlftsim.scenario.batch import collate
 from rlftsim.submission.archive import PackedShard, count_joined, join_shards, pack_shard
+from rlftsim.submission.findings import check_rollouts
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
-from rlftsim.submission.plan import GZIP_RATIO, PLAN, Plan
-from rlftsim.submission.scenario_checks import check_rollouts
+from rlftsim.submission.plan import GZIP_RATIO, PLAN, SHARDS, Job, Plan
 
 ARCHIVE = "submission.tar.gz"
-_SHARDS, _LOCK = "shards", ".lock"
-
-
-@dataclass(frozen=True)
-class Job:
-    """Input of the work on a shard; is handed to worker processes."""
-
-    policy: Policy
-    data: ScenarioDataset
-    plan: Plan
-    metadata: bytes
-    """Fields that each shard repeats, see `submission.entry`."""
-    config: EvaluateConfig
-    round_m: float | None
-    folder: Path
-
-    def shard_path(self, number: int) -> Path:
-        """File of a finished shard."""
-        return self.folder / _SHARDS / f"{number:05d}.part"
-
-    def receipt_path(self, number: int) -> Path:
-        """Receipt of a finished shard."""
-        return self.folder / _SHARDS / f"{number:05d}.json"
-
-    def receipt(self, number: int) -> PackedShard | None:
-        """A finished shard, whose file may be in the archive already; None before that."""
-        try:
-            shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
-            check_types(shard)
-        except (DataError, ConfigError, FileNotFoundError, TypeError):
-            return None
-        return shard if shard.file == self.shard_path(number).name else None
+_LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -129,7 +88,7 @@ def build_archive(
         return archive
     with Lease(job.folder / _LOCK, runner, "builds in") as lease:
         job.plan.claim(job.folder)
-        shards = job.folder / _SHARDS
+        shards = job.folder / SHARDS
         shards.mkdir(exist_ok=True)
         outputs = [
             path for n in numbers for path in (shards / job.plan.shard_name(n), job.shard_path(n), job.receipt_path(n))
@@ -151,7 +110,7 @@ def build_archive(
 def delete_shards(job: Job) -> None:
     """Remove the compressed shards of a finished archive, and the receipts."""
     paths = [path for n in range(len(job.plan.shards)) for path in (job.shard_path(n), job.receipt_path(n))]
-    remove_folder(job.folder / _SHARDS, [path.name for path in paths])
+    remove_folder(job.folder / SHARDS, [path.name for path in paths])
 
 
 def _forecast(job: Job, num_missing: int) -> None:
@@ -171,14 +130,14 @@ def _forecast(job: Job, num_missing: int) -> None:
 def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[], bool]) -> None:
     """Simulate the scenarios of a shard; write, compress and sign for the shard."""
     name = job.plan.shard_name(number)
-    raw = temporary_path(job.folder / _SHARDS / name)
+    raw = temporary_path(job.folder / SHARDS / name)
     try:
         with errors_name(raw), raw.open("wb") as file:
             file.write(job.metadata)
             for position in job.plan.shards[number]:
                 if is_stopped():
                     return
-                message = _simulate_message(job, job.data[position], name)
+                message = _simulate_message(job, position, name)
                 file.write(b"\x0a" + encode_varint(len(message)) + message)
                 advance(1)
         shard = pack_shard(raw, name, job.shard_path(number))
@@ -192,9 +151,10 @@ def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[
         log.info(f"  first shard: compressed to {ratio:.3f}, so the archive will have about {size_gb:.3g} GB.")
 
 
-def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
+def _simulate_message(job: Job, position: int, shard: str) -> bytes:
     """Serialized rollouts of a scenario for the archive, checked."""
-    states = simulate_states(job.policy, scenario, job.config, get_device(job.policy))
+    scenario = job.data[position]
+    states = simulate_states(job.policy, collate([scenario]).to(get_device(job.policy)), job.config)
     message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
     for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
         if finding.severity == "error":

@@ -21,13 +21,12 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import GzipReader
 from rlftsim.submission.entry import find_problems
-from rlftsim.submission.findings import MAX_STORED, Finding, Findings, Severity
+from rlftsim.submission.findings import MAX_STORED, Finding, Findings, Severity, check_rollouts
 from rlftsim.submission.messages import DecodedRollouts, decode_rollouts
-from rlftsim.submission.scenario_checks import check_rollouts
 
 SHARD_NAME = re.compile(r".*\.binproto(-(\d{5})-of-(\d{5}))?")
 SPLIT_NAME = re.compile(r".*\.tar\.gz\.\d{3}")
-"""Name of a part of an archive that was cut for moving it about, see `submission.split_file`."""
+"""Name of a part of an archive that was cut for moving it about, see `archive.split_file`."""
 MAX_SHARD_BYTES = 2 * 10**9
 MAX_METADATA_BYTES = 1 << 24
 DOUBTFUL_ARCHIVE_BYTES = 50 * 10**9

@@ -1,4 +1,4 @@
-"""Plan of a submission: the scenarios of each shard, and the settings that the bytes depend on."""
+"""Plan of a submission: the scenarios of each shard, the settings that bytes depend on, and the input of a build."""
 
 import hashlib
 import re
@@ -9,15 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.folder import find_differences, write_identity
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, frozen_copy
+from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.tfrecord import count_lost
+from rlftsim.submission.archive import PackedShard
+from rlftsim.submission.entry import Entry, check_closed_loop, count_parameters, describe_entry
 from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES
 
 FORMAT = "rlftsim-submission-1"
-PLAN = "plan.json"
+PLAN, SHARDS = "plan.json", "shards"
 GZIP_RATIO = (0.56, 0.64)
 """Compressed size of sampled rollouts, lowest and highest of five models."""
 _NUMBERED = re.compile(r"(.*)-(\d{5})-of-(\d{5})")
@@ -153,3 +159,73 @@ def check_complete(data: ScenarioDataset) -> None:
                 f"{name}-{absent[0]:05d}-of-{count:05d} is missing: convert it, too, or try things out with --partial; "
                 "the server refuses a submission without it."
             )
+
+
+@dataclass(frozen=True)
+class Job:
+    """Input of the work on a shard; is handed to worker processes."""
+
+    policy: Policy
+    data: ScenarioDataset
+    plan: Plan
+    metadata: bytes
+    """Fields that each shard repeats, see `submission.entry`."""
+    config: EvaluateConfig
+    round_m: float | None
+    folder: Path
+
+    def shard_path(self, number: int) -> Path:
+        """File of a finished shard."""
+        return self.folder / SHARDS / f"{number:05d}.part"
+
+    def receipt_path(self, number: int) -> Path:
+        """Receipt of a finished shard."""
+        return self.folder / SHARDS / f"{number:05d}.json"
+
+    def receipt(self, number: int) -> PackedShard | None:
+        """A finished shard, whose file may be in the archive already; None before that."""
+        try:
+            shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
+            check_types(shard)
+        except (DataError, ConfigError, FileNotFoundError, TypeError):
+            return None
+        return shard if shard.file == self.shard_path(number).name else None
+
+
+def prepare_job(
+    entry: Entry,
+    policy: Policy,
+    data: ScenarioDataset,
+    config: EvaluateConfig,
+    folder: Path,
+    *,
+    num_shards: int,
+    round_m: float | None,
+    is_partial: bool,
+) -> Job:
+    """Input of a build; everything that can be refused is refused before anything is simulated.
+
+    Args:
+        entry: Account, method and authors.
+        policy: Policy whose rollouts are submitted; left unchanged, as a frozen copy is used.
+        data: Scenarios of the split that is simulated.
+        config: Settings of the simulation.
+        folder: Folder of the archive.
+        num_shards: Files of the archive; fewer for a split with fewer scenarios.
+        round_m: Step that positions are rounded to, in meters; None = not rounded.
+        is_partial: True lets files of the split be missing, to try things out.
+
+    Raises:
+        ConfigError: A policy that breaks the challenge's rules or cannot sample so, or see `make_plan`.
+        DataError: Scenarios of another source, or a split that is not complete.
+    """
+    policy = frozen_copy(policy)
+    check_sources(data)
+    if not is_partial:
+        check_complete(data)
+    check_closed_loop(policy, data[0])
+    check_sampling(policy, data, config.sampling)
+    metadata = describe_entry(entry, count_parameters(policy))
+    fingerprint = fingerprint_policy(policy)
+    plan = make_plan(data, fingerprint, metadata, config, num_shards=num_shards, round_m=round_m)
+    return Job(policy, data, plan, metadata, config, round_m, folder)

@@ -9,13 +9,25 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import torch
+from rich.table import Table
+
 from rlftsim.errors import DataError
-from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.evaluation.results import SCHEMA, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
+from rlftsim.evaluation.rollout_files import AXES
+from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest
+from rlftsim.evaluation.score_files import format_scores, has_road_edge
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.policies.checkpoint import read_card
+from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenario
 from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding
+from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
 BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}
 """RMM on the test split with the weights of 2025, no traffic light term; from the table of RLFTSim (CVPR 2026)."""
@@ -91,8 +103,7 @@ class Report:
     def write(self, archive: Path) -> list[Path]:
         """Write `submission.report.md` and `.json` beside the archive; returns both paths."""
         json_path, text_path = (report_path(archive, ending) for ending in ("json", "md"))
-        for path in (json_path, text_path):
-            remove_temporaries([path])
+        remove_temporaries([json_path, text_path])
         write_text(text_path, self.as_text())
         write_text(json_path, json.dumps(asdict(self), indent=1) + "\n")
         return [text_path, json_path]
@@ -193,3 +204,70 @@ def _estimate_lines(estimate: Estimate | str) -> list[str]:
         note = " (within noise)" if abs(difference) <= half else ""
         lines.append(f"| {name} | {value:.4f} | {difference:+.4f}{note} |")
     return lines
+
+
+class ArchiveScores:
+    """Realism of the rollouts in an archive, scored scenario by scenario: the number that the file will get.
+
+    An instance is the `callback` of `check_archive`.
+
+    Args:
+        data: Scenarios of the archive's split.
+
+    Raises:
+        DataError: Scenarios without a logged future.
+    """
+
+    def __init__(self, data: ScenarioDataset) -> None:
+        try:
+            choose_scenarios(data, EvaluateConfig(split=data.split))
+        except DataError as error:
+            raise DataError(f"--score is for the validation split: {error}") from None
+        self._data, self._metric = data, metric_by_name("2025")
+        self._rows: list[dict[str, object]] = []
+        self._skipped: list[Skipped] = []
+
+    def __call__(self, scenario: Scenario, decoded: DecodedRollouts) -> None:
+        """Score a scenario.
+
+        Args:
+            scenario: Scenario with the logged future that the metric compares with.
+            decoded: Rollouts without an error.
+        """
+        if not has_road_edge(scenario):
+            self._skipped.append(Skipped(scenario.scenario_id, "has no road edge"))
+            return
+        assert decoded.values is not None
+        x, y, z, heading = (torch.from_numpy(decoded.values[:, :, axis].copy()) for axis in range(len(AXES)))
+        states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), x, y, z, heading)
+        result = score(scenario_log(scenario), states, self._metric)
+        self._rows.append(row_of_result(result, scenario, states))
+
+    def table(self, check: ArchiveCheck, sample: float) -> Table:
+        """Every mean score, for `print_wide`.
+
+        Args:
+            check: Finished check of the archive.
+            sample: Fraction of the scenarios that was looked at.
+
+        Raises:
+            DataError: No scenario could be scored.
+        """
+        data = self._data
+        if not self._rows:
+            reason = self._skipped[0].reason if self._skipped else "none that was read is without an error"
+            raise DataError(
+                f"--score: none of {len(data)} scenarios of split {data.split} of {data.folder} could be scored "
+                f"({reason}): see the findings above{', or give a larger --sample' if sample < 1 else ''}."
+            )
+        provenance = Provenance(
+            config=EvaluateConfig(num_rollouts=NUM_SCENES, metric=self._metric.name, split=data.split),
+            policy="rollouts of a submission",
+            policy_fingerprint=check.sha256,
+            dataset=str(data.folder.absolute()),
+            manifest_sha256=hash_manifest(data.folder),
+            sources=data.sources,
+            guessed=data.guessed,
+        )
+        table = pa.Table.from_pylist(self._rows, schema=SCHEMA)
+        return format_scores(Evaluation(check.archive, provenance, table, tuple(self._skipped)))

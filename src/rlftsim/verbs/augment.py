@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from rlftsim.evaluation.evaluate import check_jobs
-from rlftsim.jobs.runner import Work, choose_runner
+from rlftsim.jobs.runner import Work, check_jobs, choose_runner
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.open import open_dataset

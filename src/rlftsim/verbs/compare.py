@@ -39,11 +39,11 @@ def compare(a: Result, b: Result, *, alpha: float = 0.05) -> Comparison | DriveC
     return compare_evaluations(_read(a, Evaluation), _read(b, Evaluation), alpha=alpha)
 
 
-def _read(result: Any, kind: Any) -> Any:
-    """A result of a kind as it is, or read from its file."""
+def _read(result: Any, result_type: Any) -> Any:
+    """A result of a type as it is, or read from its file."""
     if isinstance(result, str | os.PathLike):
-        return kind.read(result)
-    if not isinstance(result, kind):
+        return result_type.read(result)
+    if not isinstance(result, result_type):
         raise ConfigError(f"{type(result).__name__}: not an evaluation: hand over one of rs.evaluate, or its file.")
     return result
 

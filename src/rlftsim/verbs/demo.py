@@ -11,11 +11,7 @@ from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
 from rlftsim.scenario.synthetic import pack_path
 
 
-def demo(
-    out: Path | None = None,
-    processes: int | Literal["auto"] = "auto",
-    quick: bool = False,
-) -> None:
+def demo(out: Path | None = None, processes: int | Literal["auto"] = "auto", quick: bool = False) -> None:
     """Run the whole pipeline on synthetic scenarios, in minutes, on a CPU.
 
     Vocabulary, pre-training, closed-loop fine-tuning with the MLOO reward, evaluation on held-out scenarios,

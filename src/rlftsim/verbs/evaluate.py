@@ -9,7 +9,6 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.jobs.buckets import validate_folder
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
@@ -94,17 +93,13 @@ def evaluate(
     model = with_guidance(model, guidance_scale)
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)
-    folder = None if out is None else validate_folder(out)
-    if isinstance(data, str | os.PathLike):
-        return evaluation.evaluate(model, dataset_folder(data), folder, config, name=name, runner=runner)
-    scenarios = to_scenarios(data)
-    if isinstance(scenarios, ScenarioDataset):
-        return evaluation.evaluate(model, scenarios, folder, config, name=name, runner=runner)
-    # The evaluation reads scenarios by name, in other processes too, so those of a list get a data set.
+    source = dataset_folder(data) if isinstance(data, str | os.PathLike) else to_scenarios(data)
     with tempfile.TemporaryDirectory(prefix="rlftsim-") as temporary:
-        write_dataset((scenarios[position] for position in range(len(scenarios))), f"{temporary}/scenarios")
-        listed = ScenarioDataset(f"{temporary}/scenarios")
-        return evaluation.evaluate(model, listed, folder, config, name=name, runner=runner)
+        # The evaluation reads scenarios by name, in other processes too, so those of a list get a data set.
+        if not isinstance(source, Path | ScenarioDataset):
+            write_dataset((source[position] for position in range(len(source))), f"{temporary}/scenarios")
+            source = ScenarioDataset(f"{temporary}/scenarios")
+        return evaluation.evaluate(model, source, out, config, name=name, runner=runner)
 
 
 def print_evaluation(result: Evaluation, *, out: Path) -> None:

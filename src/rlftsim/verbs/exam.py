@@ -7,9 +7,8 @@ import tyro
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
-from rlftsim.experiments.exam import CHECKOUT, LEDGER, ExamConfig, take_exam
+from rlftsim.experiments.exam import CHECKOUT, LEDGER, ExamConfig, Ledger, take_exam
 from rlftsim.experiments.exam_report import write_exam
-from rlftsim.experiments.ledger import Ledger
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import find_device

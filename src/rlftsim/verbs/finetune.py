@@ -57,8 +57,8 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
     """
     method, goal, bias = values["method"], values["goal"], values["goal_logit_bias"]
     section = find_section(method)
-    others = [name for name in ("finetune", "catk", "road", "gcsl", "calibrate") if name != section]
-    check_no_settings(flags, others, f"with --method {method}: its settings are --{section}.*")
+    other_sections = [name for name in ("finetune", "catk", "road", "gcsl", "calibrate") if name != section]
+    check_no_settings(flags, other_sections, f"with --method {method}: its settings are --{section}.*")
     if goal is None and bias is not None:
         flag = "--goal-logit-bias" if bias else "--no-goal-logit-bias"
         raise ConfigError(f"{flag} has no effect without goals: add --goal concat or --goal indication.")
@@ -142,8 +142,8 @@ def finetune(
         settings = _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
     settings = with_processes(settings, processes)
     trainer = find_method(settings)
-    every = settings.validation.every if trainer is not None and trainer.validates else 0
-    held_out = find_held_out(scenarios, validation_split, every)
+    interval = settings.validation.every if trainer is not None and trainer.validates else 0
+    held_out = find_held_out(scenarios, validation_split, interval)
     learner, device = load_start(policy)
     conditioning = "" if goal is None else GoalConditioning(goal, goal_logit_bias)
     if conditioning:

@@ -14,6 +14,7 @@ from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_line, print_wide
+from rlftsim.rollout.policy import Policy, is_goal_conditioned
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.open import check_membership
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
@@ -61,9 +62,8 @@ def propose_goals(
     for scenario_id in dict.fromkeys(scenario):
         check_membership(scenarios, scenario_id, data, "--scenario")
         logged = scenarios.by_id(scenario_id)
-        table = Table(title=f"scenario {scenario_id}", title_justify="left")
-        for heading in ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]"):
-            table.add_column(heading)
+        headings = ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]")
+        table = Table(*headings, title=f"scenario {scenario_id}", title_justify="left")
         for track in _find_tracks(logged, agent):
             proposals = propose(logged, track)
             goal = next((proposal for proposal in proposals if _is_choice(proposal, choose)), None)
@@ -116,10 +116,10 @@ def _find_tracks(scenario: Scenario, object_ids: list[int] | None) -> list[int]:
     if object_ids is None:
         return scenario.evaluated_indices.tolist()
     track_by_id = {int(scenario.tracks.object_id[track]): int(track) for track in scenario.simulated_indices}
-    unknown = [str(object_id) for object_id in object_ids if object_id not in track_by_id]
-    if unknown:
+    unknown_ids = [str(object_id) for object_id in object_ids if object_id not in track_by_id]
+    if unknown_ids:
         raise ConfigError(
-            f"no agent {', '.join(unknown)} in scenario {scenario.scenario_id}: there are "
+            f"no agent {', '.join(unknown_ids)} in scenario {scenario.scenario_id}: there are "
             f"{', '.join(map(str, sorted(track_by_id)))}."
         )
     return [track_by_id[object_id] for object_id in dict.fromkeys(object_ids)]
@@ -191,6 +191,51 @@ def warn_of_doubts(entries: Sequence[GoalEntry], scenario: Scenario) -> None:
     for entry in entries:
         for line in goal_warnings(entry, scenario):
             log.info(f"  {line}")
+
+
+def check_goal_effects(goals: GoalsFile, policy: Policy, name: str, guidance_scale: float) -> None:
+    """Check that goals and guidance have an effect.
+
+    Args:
+        goals: Goals of the simulated agents; may be empty.
+        policy: Policy that decides for all agents.
+        name: Name of the policy, for messages.
+        guidance_scale: Factor on the goal-progress bias; 1 = as learned.
+
+    Raises:
+        ConfigError: Goals of a policy that is not goal-conditioned, or guidance without goals.
+    """
+    if goals.goals and not is_goal_conditioned(policy):
+        raise ConfigError(
+            f"{name} is not goal-conditioned, {len(goals.goals)} goals would have no effect: take a model "
+            "that was fine-tuned with goals (docs/goals.md), or leave --goal and --goals out."
+        )
+    if guidance_scale != 1.0 and not goals.goals:
+        raise ConfigError(f"--guidance-scale {guidance_scale:g} has no effect without goals: add --goal or --goals.")
+
+
+def check_scenarios(
+    scenario_ids: Sequence[str], goals: GoalsFile, dataset: ScenarioDataset, name: str, has_scenario_flag: bool
+) -> None:
+    """Check scenarios and goals that are to be simulated, and log doubts.
+
+    Args:
+        scenario_ids: Ids of the scenarios.
+        goals: Goals of agents in the scenarios; may be empty.
+        dataset: Data set that must have the scenarios.
+        name: Name of the data set, for messages.
+        has_scenario_flag: True where the ids are those of `--scenario`, else those of goals.
+
+    Raises:
+        DataError: An unknown scenario, or an impossible goal.
+    """
+    for scenario_id in scenario_ids:
+        entries = goals.of_scenario(scenario_id)
+        check_membership(dataset, scenario_id, name, "--scenario" if has_scenario_flag else next(iter(entries), ""))
+        if entries:
+            warn_of_doubts(entries, dataset.by_id(scenario_id))
+        elif goals.goals:
+            log.info(f"  scenario {scenario_id} has no goals: it is simulated without.")
 
 
 def _add_rows(

@@ -1,6 +1,8 @@
 """Data sets and policies by name, and the forms in which verbs take scenarios and policies."""
 
+import inspect
 import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -139,8 +141,25 @@ def check_config(config: object, section: str, *classes: type) -> None:
         ConfigError: Settings of no such kind.
     """
     if not isinstance(config, (*classes, type(None))):
-        *most, last = (settings_class.__name__ for settings_class in classes)
-        names = f"{', '.join(most)} or {last}" if most else last
+        *class_names, last_name = (settings_class.__name__ for settings_class in classes)
+        names = f"{', '.join(class_names)} or {last_name}" if class_names else last_name
         raise ConfigError(
             f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."
         )
+
+
+def check_left_out(verb: Callable[..., Any], values: Mapping[str, Any], names: Sequence[str], reason: str) -> None:
+    """Check that arguments without effect have the default values.
+
+    Args:
+        verb: Function with the defaults.
+        values: Values of the call by argument.
+        names: Names of the arguments without effect.
+        reason: Rest of the message, behind the argument.
+
+    Raises:
+        ConfigError: An argument has a different value.
+    """
+    for name in names:
+        if values[name] != inspect.signature(verb).parameters[name].default:
+            raise ConfigError(f"{name} {reason}")

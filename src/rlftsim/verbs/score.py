@@ -8,21 +8,21 @@ from typing import Literal, overload
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.explain_page import explain_rollouts
+from rlftsim.evaluation.in_memory import score_in_memory
 from rlftsim.evaluation.results import Evaluation
-from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Unfinished, Work
-from rlftsim.realism import RealismResult, metric_by_name, score_batch
-from rlftsim.realism import score as score_scenario
-from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.realism import RealismResult
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.verbs.arguments import Data, File, ScoreMetric, Simulated
-from rlftsim.verbs.inputs import to_batch
+from rlftsim.verbs.inputs import check_left_out, to_batch
 from rlftsim.viewer.notebook import check_rollouts
+
+IN_FILES = ("out", "name", "explain", "missing_map", "missing_scenario", "limit", "jobs", "work")
+"""Arguments without effect on rollouts in memory."""
 
 
 @overload
@@ -87,20 +87,12 @@ def score(
             ScoreConfig(str(metric), missing_map, missing_scenario, limit, jobs),  # pyright: ignore[reportArgumentType]
             work,
         )  # fmt: skip
-    for option, value in {"out": out, "name": name, "explain": explain, "limit": limit, "jobs": jobs}.items():
-        if value is not None:
-            raise ConfigError(f"{option} has no effect on rollouts in memory: leave it out, or name files of rollouts.")
+    way_out = "leave it out, or name files of rollouts"
+    check_left_out(score, locals(), IN_FILES, f"has no effect on rollouts in memory: {way_out}.")
     check_rollouts("score", scenarios, rollouts)
     assert isinstance(rollouts, Rollouts)
-    batch = _matching_batch(scenarios, rollouts)
-    # in the world frame and without padding
-    states, config = states_of_rollouts(batch, rollouts), metric_by_name(str(metric))
-    for scenario, simulated in zip(batch.scenarios, states):
-        simulated.check_finite(scenario.scenario_id)
-        warn_of_doubts(scenario, simulated)
-    if isinstance(scenarios, Scenario):
-        return score_scenario(scenarios, states[0], config)
-    return score_batch(batch.scenarios, states, config)
+    batch = to_batch(scenarios, rollouts.position.device)
+    return score_in_memory(batch, rollouts, str(metric), is_single=isinstance(scenarios, Scenario))
 
 
 def _score_files(
@@ -132,35 +124,6 @@ def _score_files(
         raise
     write_pages()
     return result
-
-
-def _matching_batch(scenarios: Data, rollouts: Rollouts) -> ScenarioBatch:
-    """The scenarios that rollouts are of, as a batch in the frame of the rollouts.
-
-    Raises:
-        ConfigError: They are of other scenarios: by the ids of scenarios and agents where the rollouts know them, else
-            by numbers.
-    """
-    batch = to_batch(scenarios, rollouts.position.device)
-    about = rollouts.provenance
-    if about is not None:
-        ids = tuple(scenario.scenario_id for scenario in batch.scenarios)
-        if about.scenario_ids != ids:
-            simulated = ", ".join(about.scenario_ids[:3])
-            raise ConfigError(
-                f"rollouts of {simulated} do not belong to {', '.join(ids[:3])}: hand over the same scenarios."
-            )
-        for row, scenario in enumerate(batch.scenarios):
-            about.check_same_agents(row, scenario)
-        if batch.frame != about.frame:
-            batch = collate(batch.scenarios, frame=about.frame).to(batch.device)
-    num_scenarios, _, num_agents = rollouts.position.shape[:3]
-    if num_scenarios != batch.num_scenarios or num_agents < batch.agent_mask.shape[1]:
-        raise ConfigError(
-            f"rollouts of {num_scenarios} scenarios with up to {num_agents} agents do not belong to "
-            f"{batch.num_scenarios} with up to {batch.agent_mask.shape[1]}: hand over the same scenarios."
-        )
-    return batch
 
 
 def print_scores(result: Evaluation, *, json: bool = False) -> None:

@@ -3,23 +3,20 @@
 import time
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, DataError, shorten
-from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
-from rlftsim.evaluation.scenario_source import choose_scenarios
-from rlftsim.evaluation.score_files import format_scores
+from rlftsim.errors import ConfigError, shorten
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy
-from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.open import open_dataset
-from rlftsim.submission.build import Job, build_archive, delete_shards
+from rlftsim.submission.archive import split_file
+from rlftsim.submission.build import build_archive, delete_shards
 from rlftsim.submission.check import ArchiveCheck, check_archive
-from rlftsim.submission.closed_loop import check_closed_loop, statement
-from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
-from rlftsim.submission.plan import check_complete, check_sources, make_plan
+from rlftsim.submission.entry import count_parameters, read_entry, statement
+from rlftsim.submission.plan import prepare_job
 from rlftsim.submission.report import (
+    ArchiveScores,
     Report,
     estimate_realism,
     model_card,
@@ -27,8 +24,6 @@ from rlftsim.submission.report import (
     select_findings,
     write_findings,
 )
-from rlftsim.submission.scores import ArchiveScores
-from rlftsim.submission.transfer import split_file
 from rlftsim.verbs.arguments import Device
 
 CACHED_SCENARIOS = 2
@@ -92,40 +87,31 @@ def build(
         work: Machines that share the work.
     """
     start = time.monotonic()
-    # 1. everything that can be refused is refused before anything is simulated
     entry = read_entry(config, account=account, method=method)
-    policy = frozen_copy(load_policy(model, device))
+    policy = load_policy(model, device)
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
     settings = EvaluateConfig(
         seed=seed, temperature=temperature, top_k=top_k,
         split=split, rollouts_per_pass=rollouts_per_pass, jobs=jobs,
     )  # fmt: skip
-    check_sources(dataset)
-    if not partial:
-        check_complete(dataset)
-    check_closed_loop(policy, dataset[0])
-    check_sampling(policy, dataset, settings.sampling)
+    job = prepare_job(
+        entry, policy, dataset, settings, out, num_shards=num_shards, round_m=round, is_partial=partial
+    )  # fmt: skip
     closed_loop = statement(policy, settings.sampling)
     print(closed_loop)
     if not i_comply:
         raise ConfigError("an entry has to declare this: add --i-comply if it is true of yours.")
-    # 2. build
-    parameters = count_parameters(policy)
-    metadata = describe_entry(entry, parameters)
-    fingerprint = fingerprint_policy(policy)
-    plan = make_plan(dataset, fingerprint, metadata, settings, num_shards=num_shards, round_m=round)
-    job = Job(policy, dataset, plan, metadata, settings, round, out)
     archive = build_archive(job, runner=work.runner(jobs, work.on_error), is_deleting=delete_parts)
-    # 3. check the file that will be uploaded, and report
+    # the file that will be uploaded is checked, not what was meant to be in it
     result = check_archive(archive, dataset)
     evaluation = evaluation or EVALUATIONS / f"{evaluation_name(model)}.parquet"
     findings, counts = select_findings(result)
-    origin = {"model": model, "data set": str(dataset.folder), **plan.identity}
     report = Report(
-        archive.name, result.size, result.sha256, entry.method, parameters, len(result.shards), result.num_scenarios,
-        result.num_trajectories, result.raw_bytes, findings, counts, closed_loop, model_card(model),
-        origin, time.monotonic() - start,
-        estimate_realism(evaluation, fingerprint, settings),
+        archive.name, result.size, result.sha256, entry.method, count_parameters(policy), len(result.shards),
+        result.num_scenarios, result.num_trajectories, result.raw_bytes, findings, counts, closed_loop,
+        model_card(model), {"model": model, "data set": str(dataset.folder), **job.plan.identity},
+        time.monotonic() - start,
+        estimate_realism(evaluation, str(job.plan.identity["policy"]), settings),
     )  # fmt: skip
     text, _ = report.write(archive)
     _print_findings(result)
@@ -164,25 +150,13 @@ def check(
     if json is not None:
         check_file(json)
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
-    if score:
-        try:
-            choose_scenarios(dataset, EvaluateConfig(split=split))
-        except DataError as error:
-            raise DataError(f"--score is for the validation split: {error}") from None
-    scores = ArchiveScores() if score else None
+    scores = ArchiveScores(dataset) if score else None
     result = check_archive(archive, dataset, sample=sample, expected_sha256=reported_sha256(archive), callback=scores)
     _print_findings(result)
     if json is not None:
         write_findings(result, json)
     if scores is not None:
-        evaluation = scores.evaluation(result.archive, dataset, result.sha256)
-        if not len(evaluation):
-            reason = evaluation.skipped[0].reason if evaluation.skipped else "none that was read is without an error"
-            raise DataError(
-                f"--score: none of {len(dataset)} scenarios of split {split} of {data} could be scored "
-                f"({reason}): see the findings above{', or give a larger --sample' if sample < 1 else ''}."
-            )
-        print_wide(format_scores(evaluation))
+        print_wide(scores.table(result, sample))
     return int(result.findings.has_errors)
 
 

@@ -27,10 +27,6 @@ def synthesize(
         work: Machines that share the work.
     """
     manifest = generate(
-        destination,
-        num_scenarios=num_scenarios,
-        seed=seed,
-        jobs=jobs,
-        runner=work.runner(jobs, work.on_error),
+        destination, num_scenarios=num_scenarios, seed=seed, jobs=jobs, runner=work.runner(jobs, work.on_error)
     )
     print(f"{destination}: {sum(shard.num_rows for shard in manifest.shards)} scenarios.")

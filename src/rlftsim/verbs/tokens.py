@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.folder import check_file
@@ -84,23 +84,21 @@ def tokens(
         origin = f"{' '.join(sys.argv[1:])}; {len(scenarios)} scenarios; seed {settings.seed}"
         vocabulary, radii = build_vocabulary(scenarios, settings, origin=origin, show_progress=True)
         vocabulary.save(out)
-        where = out
+        source = out
     else:
         # npz tables of the public CAT-K code come as one file or as two.
-        where, radii = check[0], (None, None, None)
-        is_ours = len(check) == 1 and where.suffix != ".npz"
-        vocabulary = Vocabulary.load(where) if is_ours else read_catk_vocabulary(check)
+        source, radii = check[0], (None, None, None)
+        is_ours = len(check) == 1 and source.suffix != ".npz"
+        vocabulary = Vocabulary.load(source) if is_ours else read_catk_vocabulary(check)
     # 2. its coverage, measured on the same scenarios that it is built from
     sample = {"max_scenarios": settings.max_scenarios, "seed": settings.seed}
     classes = measure_coverage(scenarios, vocabulary, radii_m=radii, show_progress=True, **sample)
-    folder = report or where.with_suffix(".report")
+    folder = report or source.with_suffix(".report")
     compared = len(scenarios) if settings.max_scenarios is None else min(len(scenarios), settings.max_scenarios)
-    write_vocabulary_report(folder, classes, vocabulary=where.name, data=f"{compared} scenarios of {data}, {split}")
+    write_vocabulary_report(folder, classes, vocabulary=source.name, data=f"{compared} scenarios of {data}, {split}")
     # 3. the same numbers as in the report, on the terminal
-    table = Table(title="How well the tokens cover the data", title_justify="left")
-    table.add_column("")
-    for coverage in classes:
-        table.add_column(coverage.class_name, justify="right")
+    columns = (Column(coverage.class_name, justify="right") for coverage in classes)
+    table = Table("", *columns, title="How well the tokens cover the data", title_justify="left")
     for name, words in ROWS.items():
         table.add_row(name, *(words(coverage) for coverage in classes))
     print_wide(table)
@@ -108,7 +106,7 @@ def tokens(
         if coverage.num_tokens == 1 and coverage.use.sum() > 1:
             log.info(f"{coverage.class_name}s have a single token, which stands still: their motion cannot be learned.")
     counts = ", ".join(f"{c.num_tokens} {c.class_name}" for c in classes)
-    print(f"{where}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
+    print(f"{source}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
 
 
 def _check_is_vocabulary(path: Path) -> None:

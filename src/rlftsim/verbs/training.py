@@ -12,8 +12,7 @@ from typing import Any
 from torch import nn
 
 from rlftsim.errors import ConfigError, RlftsimError
-from rlftsim.evaluation.calibration_picture import write_calibration_picture
-from rlftsim.evaluation.learning_curve import write_learning_curve
+from rlftsim.evaluation.learning_curve import write_calibration_picture, write_learning_curve
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.card import append_cards, model_card

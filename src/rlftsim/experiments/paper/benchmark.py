@@ -8,12 +8,11 @@ import numpy as np
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.compare import paired_values
 from rlftsim.evaluation.results import Evaluation
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, CATK, CONSTANT_VELOCITY, ORACLE, ROAD, FineTuned, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import RMM, Row, build_table, draw_gains, to_numbers
 
 REFERENCE, TUNED, CEILING, FLOOR = "base", "RLFTSim (MLOO)", "oracle", "constant velocity"
 IMITATIONS = {"CAT-K": CATK, "RoaD": ROAD}
@@ -41,7 +40,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     closed = {row.name: compute_gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
     return ExperimentResult(
         title="Benchmark: realism of the base model, closed-loop imitation and RLFTSim",
-        tables=(tables.build_table("Ours", rows.values(), SCORES), published.load_table("benchmark")),
+        tables=(build_table("Ours", rows.values(), SCORES), published.load_table("benchmark")),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
             *(v for row in imitations for v in (row.against(base), row.seeds_against(base), tuned.against(row))),
@@ -58,11 +57,11 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "would give.",
         ),
         numbers={
-            "rows": tables.to_numbers(rows.values(), SCORES),
+            "rows": to_numbers(rows.values(), SCORES),
             "gain_by_seed": {row.name: row.gains_over(base).tolist() for row in (*imitations, tuned)},
             "gap_closed": {name: {"fraction": g.fraction, "interval": g.interval} for name, g in closed.items()},
         },
-        figure=tables.draw_gains(base, [tuned, *imitations, rows[CEILING], rows[FLOOR]]),
+        figure=draw_gains(base, [tuned, *imitations, rows[CEILING], rows[FLOOR]]),
     )
 
 

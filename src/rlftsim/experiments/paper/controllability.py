@@ -30,7 +30,7 @@ Curves = Mapping[str, Mapping[str, MeanInterval]]
 def open_held_out(suite: ExperimentSuite) -> tuple[ScenarioDataset, tuple[str, ...]]:
     """Held-out scenarios of a suite, and the ids to measure on."""
     dataset = ScenarioDataset(suite.data, suite.evaluation.split)
-    return dataset, tuple(dataset.scenario_ids[i] for i in choose_scenarios(dataset, suite.evaluation))
+    return dataset, tuple(choose_scenarios(dataset, suite.evaluation))
 
 
 def measure_attainment(

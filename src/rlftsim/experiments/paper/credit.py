@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 
 from rlftsim.evaluation.columns import COLUMNS
-from rlftsim.experiments import tables
 from rlftsim.experiments.paper import reward_ablation
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import Row, build_table, draw_gains, to_numbers
 
 COMPARED = ("MLOO", "MLOO, credit by agent")
 
@@ -22,7 +21,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     base, plain, split = rows.values()  # in the order of `run`
     return ExperimentResult(
         title="Credit assignment: MLOO for whole rollouts, and for each agent",
-        tables=(tables.build_table("Ours", rows.values(), COLUMNS),),
+        tables=(build_table("Ours", rows.values(), COLUMNS),),
         verdicts=(
             *(split.against(plain), plain.against(base), split.against(base)),
             *(plain.seeds_against(base), split.seeds_against(base)),
@@ -31,8 +30,8 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             suite.budget.note,
             "The paper gives every decision of a rollout the same reward; it has no number for the other.",
         ),
-        numbers={"rows": tables.to_numbers(rows.values(), COLUMNS)},
-        figure=tables.draw_gains(base, [plain, split]),
+        numbers={"rows": to_numbers(rows.values(), COLUMNS)},
+        figure=draw_gains(base, [plain, split]),
     )
 
 

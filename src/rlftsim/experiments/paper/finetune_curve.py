@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from rlftsim.evaluation.columns import SCORES
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, CATK, WEAK_EPOCHS, Base, FineTuned, ModelSpec, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import RMM, Row, build_gain_band, build_table, to_numbers
 from rlftsim.viewer.figure import draw_bands
 
 EPOCHS_FRACTIONS = (0.25, 0.5, 1.0, 1.5)
@@ -80,12 +79,12 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         best = max(points, key=lambda row: row.mean.mean_and_error(RMM).mean)
         verdicts.append(f"best of its curve: {best.against(start)}")
         level = start.mean.mean_and_error(RMM).mean
-        bands.append(tables.build_gain_band(name, start, list(zip(epochs, points)), level=level, color=number))
+        bands.append(build_gain_band(name, start, list(zip(epochs, points)), level=level, color=number))
     for first, second in (pair for pair in PAIRS if set(pair) <= set(measured_curves)):
         verdicts += [rows[point(second, length)].against(rows[point(first, length)]) for length in epochs]
     return ExperimentResult(
         title="Realism against epochs of fine-tuning",
-        tables=(tables.build_table("Ours", rows.values(), SCORES[:4]), published.load_table("finetune-curve")),
+        tables=(build_table("Ours", rows.values(), SCORES[:4]), published.load_table("finetune-curve")),
         verdicts=tuple(verdicts),
         notes=(
             "At equal epochs all curves had the same number of updates of as many scenarios; RLFTSim simulates "
@@ -94,7 +93,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "CAT-K are runs of their own, because its learning rate falls towards the end.",
             "The best point of a curve is chosen with the scenarios it is evaluated on, which flatters it a little.",
         ),
-        numbers={"rows": tables.to_numbers(rows.values(), SCORES[:4]), "epochs": epochs},
+        numbers={"rows": to_numbers(rows.values(), SCORES[:4]), "epochs": epochs},
         figure=draw_bands(
             bands,
             title="Realism against fine-tuning",

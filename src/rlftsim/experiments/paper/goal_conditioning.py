@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rlftsim.evaluation.columns import GOAL_COLUMNS
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import GCFT, GCSL, FineTuned, GoalRewardType, GoalTraining, Guided, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import RMM, Row, build_table, to_numbers
 from rlftsim.viewer.figure import Interval, draw_intervals
 
 MISS = "passing_miss_rate"
@@ -90,8 +89,8 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
     return ExperimentResult(
         title="Goal conditioning: goals that agents miss, and the cost in realism",
         tables=(
-            tables.build_table("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
-            tables.build_table("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
+            build_table("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
+            build_table("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
             published.load_table("goal-conditioning"),
         ),
         verdicts=(
@@ -110,7 +109,7 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
             "endpoint; percentage of agents and rollouts. In all rollouts: percentage of agents that miss in every "
             "one of them.",
         ),
-        numbers={"rows": tables.to_numbers([start, *conditioned, *without_goals], GOAL_COLUMNS)},
+        numbers={"rows": to_numbers([start, *conditioned, *without_goals], GOAL_COLUMNS)},
         figure=draw_intervals(
             intervals,
             title="Agents that never pass their goal",
@@ -129,8 +128,5 @@ def _format_misses(start: Row, row: Row) -> str:
 
 
 EXPERIMENT = Experiment(
-    "Do goal-conditioned agents follow their goals, and what does it cost in realism?",
-    run,
-    summarize,
-    needs_goals=True,
+    "Do goal-conditioned agents follow their goals, and what does it cost in realism?", run, summarize, needs_goals=True
 )

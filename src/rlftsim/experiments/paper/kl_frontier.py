@@ -5,13 +5,12 @@ from dataclasses import replace
 
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, SCORES
 from rlftsim.evaluation.compare import compare
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, FineTuned, over_seeds
 from rlftsim.experiments.paper import paired_ttest, published, reward_ablation
 from rlftsim.experiments.paper.reward_ablation import MLOO, REFERENCE
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row, mean_of_seeds
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import RMM, Row, build_gain_band, build_table, mean_of_seeds, to_numbers
 from rlftsim.viewer.figure import draw_bands
 
 FRACTIONS = (0.25, 0.5, 1.0)
@@ -70,16 +69,16 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     matrix = paired_ttest.summarize(equal, suite)
     # 2. Curves of the gain, whose bands leave out that some scenarios are harder for all models.
     bands = [
-        tables.build_gain_band(name, base, frontier[1:], color=number)
+        build_gain_band(name, base, frontier[1:], color=number)
         for number, (name, frontier) in enumerate(frontiers.items())
     ]
     measured = [Row(f"{name}, KL {k:.4f}", row.by_seed) for name, line in frontiers.items() for k, row in line[1:]]
     return ExperimentResult(
         title="Rewards at equal KL to the base model",
         tables=(
-            tables.build_table(f"At a KL of {kl:.4f} nats a decision", (base, *equal.values()), COLUMNS),
+            build_table(f"At a KL of {kl:.4f} nats a decision", (base, *equal.values()), COLUMNS),
             replace(matrix.tables[0], title="Row against column, at that KL"),
-            tables.build_table("Measured", (base, *measured), COLUMNS),
+            build_table("Measured", (base, *measured), COLUMNS),
             published.load_table("rewards"),
         ),
         verdicts=(_format_order(equal, kl), *(row.against(base) for row in equal.values()), *matrix.verdicts),
@@ -91,8 +90,8 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         ),
         numbers={
             "kl": kl,
-            "at_equal_kl": tables.to_numbers((base, *equal.values()), COLUMNS),
-            "measured": tables.to_numbers((base, *measured), COLUMNS),
+            "at_equal_kl": to_numbers((base, *equal.values()), COLUMNS),
+            "measured": to_numbers((base, *measured), COLUMNS),
             "t_test": matrix.numbers,
         },
         figure=draw_bands(

@@ -7,12 +7,11 @@ from pathlib import Path
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.evaluate import evaluate
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, CONSTANT_VELOCITY, FineTuned, ModelSpec, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import Row, build_table, draw_gains, to_numbers
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
 
@@ -74,7 +73,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     bases = [row for name, row in rows.items() if UNTUNED in name]
     return ExperimentResult(
         title="Model agnosticism: RLFTSim on two architectures",
-        tables=(tables.build_table("Ours", rows.values(), SCORES), published.load_table("model-agnosticism")),
+        tables=(build_table("Ours", rows.values(), SCORES), published.load_table("model-agnosticism")),
         verdicts=(
             *(base.against(rows[FLOOR]) for base in bases),
             *(
@@ -98,10 +97,10 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "Mean actions: rollouts at temperature 0, without exploration noise.",
         ),
         numbers={
-            "rows": tables.to_numbers(rows.values(), SCORES),
+            "rows": to_numbers(rows.values(), SCORES),
             "gain_by_seed": {tuned.name: tuned.gains_over(base).tolist() for base, tuned in pairs},
         },
-        figure=tables.draw_gains(rows[FLOOR], [row for name, row in rows.items() if name != FLOOR]),
+        figure=draw_gains(rows[FLOOR], [row for name, row in rows.items() if name != FLOOR]),
     )
 
 

@@ -9,12 +9,11 @@ from collections.abc import Mapping
 
 from rlftsim.evaluation.columns import SCORES, format_number
 from rlftsim.evaluation.results import Evaluation
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import ORACLE
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import RMM, Row, TextTable, build_table, to_numbers
 from rlftsim.realism import FEATURE_NAMES, metric_by_name
 from rlftsim.statistics import MeanInterval
 from rlftsim.viewer.figure import Interval, draw_intervals
@@ -34,7 +33,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         title="Oracle: the log against itself",
         tables=(
             build_feature_table(features, weights, row.mean),
-            tables.build_table("Ours, in all", [row], SCORES),
+            build_table("Ours, in all", [row], SCORES),
             published.load_table("oracle"),
         ),
         verdicts=(
@@ -43,7 +42,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         ),
         notes=("A likelihood is missing (–) where no scenario has a step at which the feature counts.",),
         numbers={
-            "rows": tables.to_numbers([row], SCORES),
+            "rows": to_numbers([row], SCORES),
             "features": {
                 name: {"weight": weights[name], "likelihood": e.mean, "standard_error": e.standard_error}
                 for name, e in features.items()
@@ -60,7 +59,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
 
 def build_feature_table(
     features: Mapping[str, MeanInterval], weights: Mapping[str, float], evaluation: Evaluation
-) -> tables.TextTable:
+) -> TextTable:
     """Table of the features' weights, likelihoods and costs.
 
     Args:
@@ -79,7 +78,7 @@ def build_feature_table(
         rows.append((name.replace("_", " "), f"{weights[name]:g}", likelihood, cost))
     note = f"{len(evaluation)} scenarios, metric {evaluation.config.metric}; mean ± standard error."
     headings = ("feature", "weight", "likelihood ↑", "missing to 1, weighted ↓")
-    return tables.TextTable("Ours, by feature", headings, tuple(rows), note)
+    return TextTable("Ours, by feature", headings, tuple(rows), note)
 
 
 EXPERIMENT = Experiment(

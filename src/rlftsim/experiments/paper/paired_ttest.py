@@ -8,9 +8,8 @@ from jaxtyping import Int
 from rlftsim.evaluation.compare import compare
 from rlftsim.experiments.paper import published, reward_ablation
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import TextTable
+from rlftsim.experiments.tables import RMM, Row, TextTable
 from rlftsim.viewer.figure import draw_verdicts
 
 ALPHA = 1e-3

@@ -13,12 +13,11 @@ from jaxtyping import Float
 
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.compare import paired_values
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, Base, FineTuned
 from rlftsim.experiments.paired_animation import PairedAnimation, animate_pair
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import RMM, Row, TextTable, build_table, to_numbers
 from rlftsim.scenario.dataset import ScenarioDataset
 
 SPECS: dict[str, Base | FineTuned] = {"base": BASE, "RLFTSim (MLOO)": FineTuned("mloo")}
@@ -93,8 +92,8 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
     return ExperimentResult(
         title="The same scenario with the same noise, before and after fine-tuning",
         tables=(
-            tables.build_table("All held-out scenarios", [base, tuned], SCORES),
-            tables.TextTable("Shown", headings, cells, note),
+            build_table("All held-out scenarios", [base, tuned], SCORES),
+            TextTable("Shown", headings, cells, note),
         ),
         verdicts=tuple(f"{heading}, {tuned.against(base, column)}" for heading, column in VERDICTS.items()),
         notes=(
@@ -105,7 +104,7 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
             suite.budget.note,
         ),
         numbers={
-            "rows": tables.to_numbers([base, tuned], SCORES),
+            "rows": to_numbers([base, tuned], SCORES),
             "pairs": [
                 {name: getattr(pair, name) for name in ("scenario_id", "rollout", "rates", "events")}
                 for pair in pairs.animations.values()

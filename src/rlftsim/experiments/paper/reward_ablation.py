@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rlftsim.evaluation.columns import COLUMNS
-from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, FineTuned, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
-from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import Row, TextTable, build_table, draw_gains, to_numbers
 from rlftsim.training.run_folder import read_metrics
 
 REFERENCE, MLOO = "base", "MLOO"
@@ -58,7 +57,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     return ExperimentResult(
         title="Rewards: the same budget of fine-tuning with each of them",
         tables=(
-            tables.build_table("Ours", rows.values(), COLUMNS),
+            build_table("Ours", rows.values(), COLUMNS),
             *((distances,) if distances.rows else ()),
             published.load_table("rewards"),
             published.load_table("heuristics"),
@@ -74,17 +73,17 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "Equal budgets are not equal distances: rewards differ in size, so they pull with different force "
             "against the same KL penalty, and in a short run its controller does not catch up.",
         ),
-        numbers={"rows": tables.to_numbers(rows.values(), COLUMNS)},
-        figure=tables.draw_gains(base, tuned),
+        numbers={"rows": to_numbers(rows.values(), COLUMNS)},
+        figure=draw_gains(base, tuned),
     )
 
 
-def _tabulate_distances(suite: ExperimentSuite) -> tables.TextTable:
+def _tabulate_distances(suite: ExperimentSuite) -> TextTable:
     """Distance of each fine-tuned model from the base model at the end of its runs; no rows where there are no runs."""
     means = {name: mean_at_end(suite, over_seeds(spec, suite.num_seeds)) for name, spec in REWARDS.items()}
     rows = [(name, *(f"{mean[metric]:.3g}" for metric in DISTANCES)) for name, mean in means.items() if mean]
     note = f"Means over the last {FINAL_PERCENT} % of the updates; training rollouts."
-    return tables.TextTable("Distance from the base model", ("", *DISTANCES.values()), tuple(rows), note)
+    return TextTable("Distance from the base model", ("", *DISTANCES.values()), tuple(rows), note)
 
 
 def mean_at_end(suite: ExperimentSuite, specs: Sequence[FineTuned]) -> dict[str, float]:

@@ -161,7 +161,5 @@ def _draw_figure(mloo: Scaling, rloo: Scaling, sizes: Float[np.ndarray, "sizes"]
 
 
 EXPERIMENT = Experiment(
-    "Does the variance of the leave-one-out reward fall with the square of the number of rollouts?",
-    run,
-    summarize,
+    "Does the variance of the leave-one-out reward fall with the square of the number of rollouts?", run, summarize
 )
