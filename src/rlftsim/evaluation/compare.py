@@ -187,10 +187,12 @@ class ScenarioResults(Protocol):
     @property
     def name(self) -> str:
         """Name in messages."""
+        ...
 
     @property
     def scenario_ids(self) -> list[str]:
         """Scenario of each row."""
+        ...
 
 
 def pair_rows(a: ScenarioResults, b: ScenarioResults) -> tuple[list[int], list[int]]:
@@ -231,7 +233,8 @@ def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str],
         ConfigError: A column that no evaluation has.
     """
     rows_a, rows_b = pair_rows(a, b)
-    return [a.scenario_ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
+    ids = a.scenario_ids
+    return [ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
 
 
 def compare_paired(

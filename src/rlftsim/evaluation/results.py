@@ -213,7 +213,7 @@ class Evaluation:
         """A sentence on guessed values of the log; empty without any."""
         return guessed_note(self.provenance.sources, self.provenance.guessed)
 
-    @cached_property
+    @property
     def scenario_ids(self) -> list[str]:
         """Scored scenarios, in the order of the rows."""
         return self.table["scenario_id"].to_pylist()
