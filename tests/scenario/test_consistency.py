@@ -8,6 +8,7 @@ import pytest
 import scenes
 from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.inspect import find_problems
 from rlftsim.scenario.types import ObjectType
 from rlftsim.scenario.womd import read_scenarios
 
@@ -84,6 +85,18 @@ def test_heights_of_another_frame_contradict_the_map_and_none_jumps(tracks, chan
     assert describe_contradictions(tracks, scenario.map_features) == ""
     assert text in describe_contradictions(moved, scenario.map_features)
     assert describe_contradictions(moved, scenario.map_features, guessed={"z"}) == ""
+
+
+def test_a_single_track_whose_height_jumps_is_found_and_does_not_condemn_the_scenario(tracks):
+    scenario = scenes.straight_road()
+    position = tracks.position.copy()
+    position[0, 41:, 2] += 4
+    moved = replace(tracks, position=position)
+    assert "jump" not in describe_contradictions(moved, None)
+    details = [
+        finding.detail for finding in find_problems(replace(scenario, tracks=moved)) if finding.problem == "teleport"
+    ]
+    assert details == [f"track {tracks.object_id[0]} climbs or falls by 4.0 m from step 40 to 41"]
 
 
 def test_tracks_on_either_level_of_a_bridge_and_far_from_the_map_are_on_its_heights(tracks):

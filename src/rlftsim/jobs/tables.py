@@ -131,11 +131,12 @@ def _limited_memory(num_bytes: int) -> Iterator[None]:
     """
     try:
         import resource
-    except ImportError:  # no such limits on this platform
+
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except (ImportError, OSError):  # no such limits, or no such file, on this platform
         yield
         return
     with _memory_limit:
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         before = resource.getrlimit(resource.RLIMIT_AS)
         limits = [limit for limit in (used + num_bytes, *before) if limit != resource.RLIM_INFINITY]
         resource.setrlimit(resource.RLIMIT_AS, (min(limits), before[1]))

@@ -100,14 +100,15 @@ def _describe_heights(
     is_observed: Bool[np.ndarray, "O s"],
     is_moving: Bool[np.ndarray, "O s"],
 ) -> Iterator[str]:
-    """Heights that jump, and those of most moving tracks that are not the map's."""
+    """Heights that jump in most tracks, and those of most moving tracks that are not the map's."""
     with np.errstate(invalid="ignore", over="ignore"):
         climb_m = np.abs(np.diff(tracks.position[..., 2])) * is_observed
     jumps = np.argwhere(climb_m > MAX_CLIMB_M)
-    if len(jumps):
+    num_jumping = len(set(jumps[:, 0]))
+    if 2 * num_jumping > is_observed.any(1).sum():  # a single one is a finding of `find_problems`
         track, step = jumps[0]
         yield (
-            f"heights (z) jump in {len(set(jumps[:, 0]))} of {len(climb_m)} tracks: track {tracks.object_id[track]} "
+            f"heights (z) jump in {num_jumping} of {len(climb_m)} tracks: track {tracks.object_id[track]} "
             f"climbs or falls by {climb_m[track, step]:.1f} m from step {step} to {step + 1}"
         )
     points = np.zeros((0, 3)) if map_features is None else _sample_points(map_features)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.consistency import describe_contradictions
+from rlftsim.scenario.consistency import MAX_CLIMB_M, describe_contradictions
 from rlftsim.scenario.dataset import (
     INDEX,
     Manifest,
@@ -201,13 +201,18 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
 
     # Jumps between two valid states that no road user makes.
     with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
-        moved = np.diff(tracks.position[..., :2].astype(np.float64), axis=1)  # [O, S-1, 2]
+        moved = np.diff(tracks.position.astype(np.float64), axis=1)  # [O, S-1, 3]
     both_valid = tracks.valid[:, 1:] & tracks.valid[:, :-1]
     speed = np.where(both_valid, np.hypot(moved[..., 0], moved[..., 1]), 0.0) / STEP_S  # [O, S-1]
-    entries = np.argwhere(speed > TELEPORT_SPEED_MPS)
+    climb = np.where(both_valid & ("z" not in scenario.guessed), np.abs(moved[..., 2]), 0.0)
+    entries = np.argwhere((speed > TELEPORT_SPEED_MPS) | (climb > MAX_CLIMB_M))
     if len(entries):
         track, step = entries[0]
-        detail = f"track {tracks.object_id[track]} moves {speed[track, step] * STEP_S:.1f} m from step {step} to "
+        is_fast = speed[track, step] > TELEPORT_SPEED_MPS
+        motion = (
+            f"moves {speed[track, step] * STEP_S:.1f}" if is_fast else f"climbs or falls by {climb[track, step]:.1f}"
+        )
+        detail = f"track {tracks.object_id[track]} {motion} m from step {step} to "
         yield Finding(Problem.TELEPORT, scenario_id, f"{detail}{step + 1}{_format_repeats(len(entries))}")
 
     features = scenario.map_features
