@@ -77,5 +77,5 @@ def drive(
             print(f"{result.name}: failed in {len(failures)} of {count} scenarios, which the means leave out.")
     for scenario_id in driving.choose_films(results, film) if film is not None else ():
         print(driving.film(config, scenario_id, out))
-    print(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")
+    print_line(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")
     return int(any(result.failures for result in results))

@@ -117,4 +117,4 @@ def print_evaluation(result: Evaluation, *, out: Path) -> None:
     print_wide(format_table(result))
     for skipped in result.skipped:
         print_line(f"  skipped {skipped.scenario_id}: {skipped.reason}")
-    print(f"{out / result.name}.parquet")
+    print_line(f"{out / result.name}.parquet")

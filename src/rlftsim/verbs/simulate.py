@@ -11,6 +11,7 @@ from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.exporters import exporter_by_name, report_rollouts
 from rlftsim.evaluation.in_memory import simulate_in_memory
 from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work, check_jobs, choose_runner
 from rlftsim.policies.registry import with_guidance
 from rlftsim.rollout.policy import Sampling, frozen_copy, get_device, is_training
@@ -146,4 +147,4 @@ def print_rollouts(paths: list[Path], *, out: Path, num_rollouts: int) -> None:
         out: Folder of the rollouts, see `simulate`.
         num_rollouts: Number of rollouts of each scenario.
     """
-    print(f"{out}: {num_rollouts} rollouts of {len(paths)} scenarios.")
+    print_line(f"{out}: {num_rollouts} rollouts of {len(paths)} scenarios.")

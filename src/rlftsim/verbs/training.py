@@ -13,7 +13,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.learning_curve import write_calibration_picture, write_learning_curve
-from rlftsim.jobs.progress import log
+from rlftsim.jobs.progress import log, print_line
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.card import append_cards, model_card
 from rlftsim.rollout.policy import Policy, get_device
@@ -89,7 +89,7 @@ def print_model(policy: Policy, *, out: Path) -> None:
         policy: Trained policy.
         out: Folder of the run.
     """
-    print(f"model: {out / 'model'}")
+    print_line(f"model: {out / 'model'}")
 
 
 def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str:
