@@ -16,6 +16,7 @@ from rlftsim.scenario.dataset import (
     write_index_and_manifest,
 )
 from rlftsim.scenario.inspect import Problem, dataset_stats, find_problems, verify_dataset
+from rlftsim.scenario.shards import check_scenario
 from rlftsim.scenario.source import CONTRADICTORY
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
@@ -244,3 +245,11 @@ def test_timestamps_that_are_no_list_are_named(make_message):
     object.__setattr__(scenario, "timestamps_s", None)  # as a damaged shard has them
     with pytest.raises(DataError, match="timestamps are None, not one number for each step"):
         scenario.check_consistency()
+
+
+@pytest.mark.parametrize("value", [None, np.array(3, np.int32), np.zeros(2, np.int32)])
+def test_arrays_of_the_scenario_itself_have_the_declared_axes(make_message, value):
+    scenario = scenario_from_bytes(make_message("a").SerializeToString())
+    object.__setattr__(scenario, "tracks_to_predict", value)  # as a damaged shard has them
+    with pytest.raises(DataError, match=r"scenario\.(tracks_to_predict|difficulty) (is|has the shape)"):
+        check_scenario(scenario)

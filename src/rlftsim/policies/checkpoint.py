@@ -15,7 +15,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -83,6 +83,23 @@ class StoredModel:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited
             cause = " ".join(str(error).split())
             raise CheckpointError(f"{self.folder / CONFIG}: settings do not fit {make.__name__} ({cause}).") from error
+
+    def pop(self, name: str, make: Callable[..., Loaded]) -> Loaded:
+        """Take out of the settings those of a section, which may be missing, and build what they describe.
+
+        Args:
+            name: Name of the section, an object in config.json.
+            make: Dataclass of the settings; with its defaults where the section is missing.
+
+        Raises:
+            CheckpointError: The section is no object, or its settings are unknown or of wrong types.
+        """
+        section = self.config.pop(name, None)
+        if section is None:
+            return make()
+        if not isinstance(section, dict):
+            raise CheckpointError(f"{self.folder / CONFIG}: {name} has to be an object: write the folder again.")
+        return replace(self, config=section).build(make)
 
     def load(self, make: Callable[..., Loaded]) -> Loaded:
         """Policy built from the stored settings, with the stored weights if there are any.

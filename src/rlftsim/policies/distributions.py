@@ -25,6 +25,8 @@ FULL = Sampling()
 """The whole, untempered distribution."""
 NEVER = -1e9
 """Logit of a token that does not exist."""
+TIE_NATS = 1e-3
+"""Logits this close to that of the last token kept by a truncation are ties."""
 ROWS_PER_BLOCK = {"cpu": 256}
 """Rows whose tokens are processed together: on a processor they fit its cache."""
 ROWS_PER_DEVICE_BLOCK = 1 << 14
@@ -142,25 +144,30 @@ class CategoricalDistribution:
     """Distributions of the R elements whose mask is True, in the order of `mask.nonzero()`.
 
     All other elements (padding) decide 0 with probability 1. Off the CPU padding may have rows that say so.
+
+    The model's sampling is a part of the distribution: a token that it excludes has no probability. The KL divergence
+    is over the tokens that are left here, so that a reference which excludes others leaves it finite.
     """
 
     logits: Float[Tensor, "R V"]
     """float32; tokens that do not exist have a large negative logit."""
     mask: Bool[Tensor, "*batch"]
+    sampling: Sampling = FULL
 
     @cached_property
     def log_probs(self) -> Float[Tensor, "R V"]:
-        """Log-probabilities of all tokens."""
-        return torch.log_softmax(self.logits, -1)
+        """Log-probabilities of all tokens; about `NEVER` for those that the model's sampling excludes."""
+        return self._normalize(self)
 
     @torch.no_grad()
     def sample(self, sampling: Sampling, noise: Float[Tensor, "*batch 1"]) -> Int64[Tensor, "*batch"]:
         """Token ids, by inverting the cumulative distribution at the noise.
 
         Args:
-            sampling: Temperature and truncation of the draw; temperature 0 takes the mode.
+            sampling: Temperature and truncation of the draw, on top of the model's; temperature 0 takes the mode.
             noise: Uniform numbers in [0, 1), one per element.
         """
+        sampling = self.sampling.narrow(sampling)
         if sampling.temperature == 0:
             return self._dense(self.logits.argmax(-1))
         logits, token_id = self._truncate(sampling)
@@ -175,8 +182,10 @@ class CategoricalDistribution:
 
         Args:
             decision: Token ids in the vocabulary, as `sample` returns.
-            sampling: Temperature and truncation of the draw. A token that truncation excludes has -inf.
+            sampling: Temperature and truncation of the draw, on top of the model's. A token that truncation excludes
+                has -inf.
         """
+        sampling = self.sampling.narrow(sampling)
         if sampling.temperature == 0:
             return self._dense(torch.zeros_like(self.logits[:, 0]))
         token = self._rows(decision)[:, None]  # [R, 1]
@@ -186,16 +195,30 @@ class CategoricalDistribution:
         # log p = logit of the token - logsumexp of the logits after truncation, at the temperature
         logit = self.logits.gather(-1, token) / sampling.temperature
         if token_id is not None:
-            logit = logit.masked_fill((token_id != token).all(-1, keepdim=True), -torch.inf)
+            # a draw on the edge stays one where rounding, as of another batch, puts its rival before it
+            logit = logit.masked_fill(logit < logits.amin(-1, keepdim=True) - TIE_NATS, -torch.inf)
         return self._dense(logit[:, 0] - logits.logsumexp(-1))
 
     def kl(self, reference: "CategoricalDistribution") -> Float[Tensor, "*batch"]:
         """KL(self || reference), nats."""
-        return self._dense((self.log_probs.exp() * (self.log_probs - reference.log_probs)).sum(-1))
+        is_full = self.sampling.is_full and reference.sampling.is_full
+        log_q = reference.log_probs if is_full else self._normalize(reference)
+        return self._dense((self.log_probs.exp() * (self.log_probs - log_q)).sum(-1))
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Entropy, nats."""
         return self._dense(-(self.log_probs.exp() * self.log_probs).sum(-1))
+
+    def _normalize(self, dist: "CategoricalDistribution") -> Float[Tensor, "R V"]:
+        """Log-probabilities of a distribution of the same elements, over the tokens that this one may draw."""
+        if self.sampling.is_full:
+            return torch.log_softmax(dist.logits, -1)
+        logits = dist.logits / dist.sampling.temperature
+        token_id = self._truncate(self.sampling)[1]
+        if token_id is not None:
+            is_excluded = torch.ones_like(logits, dtype=torch.bool).scatter_(-1, token_id, False)
+            logits = logits.masked_fill(is_excluded, NEVER)
+        return torch.log_softmax(logits, -1)
 
     @cached_property
     def _likeliest(self) -> dict[int, Int64[Tensor, "R K"]]:
@@ -234,6 +257,7 @@ class TokenDistribution(CategoricalDistribution):
 
     logits: Float[Tensor, "R V"]
     mask: Bool[Tensor, "*batch"]
+    sampling: Sampling = FULL
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +266,7 @@ class LazyTokenDistribution(CategoricalDistribution):
 
     rows: TokenRows
     mask: Bool[Tensor, "*batch"]
+    sampling: Sampling = FULL
 
     @cached_property
     def logits(self) -> Float[Tensor, "R V"]:
@@ -259,7 +284,7 @@ class LazyTokenDistribution(CategoricalDistribution):
             decision: Token ids in the vocabulary, as `sample` returns.
             sampling: Temperature and truncation of the draw; the defaults draw from the full distribution.
         """
-        if not sampling.is_full:
+        if not self.sampling.narrow(sampling).is_full:
             return super().log_prob(decision, sampling)
         return self._dense(compute_row_statistics(self.rows, self._rows(decision))[0])
 
@@ -270,7 +295,7 @@ class LazyTokenDistribution(CategoricalDistribution):
             decision: Token ids, drawn from the full distribution.
             reference: Distribution of the same elements; receives no gradient.
         """
-        if not isinstance(reference, LazyTokenDistribution):
+        if not (isinstance(reference, LazyTokenDistribution) and self.sampling.is_full):
             return DecisionStatistics(self.log_prob(decision), self.kl(reference), self.entropy())
         statistics = compute_row_statistics(self.rows, self._rows(decision), reference.rows)
         return DecisionStatistics(*(self._dense(values) for values in statistics))

@@ -379,7 +379,7 @@ class Rules(_Subject):
         # two more agents than there are: even the largest scenario has padding
         padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
         values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
-        return _check_limit(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
+        return _check_limit(max(float(v[padding].detach().abs().max()) for v in values), 0.0, "largest value")
 
     def entropy_matches_monte_carlo(self) -> str:
         """The entropy is the mean of minus the log-probability of draws."""
@@ -389,6 +389,8 @@ class Rules(_Subject):
     def kl_matches_monte_carlo(self) -> str:
         """The KL divergence from a second policy is the mean log-ratio of draws."""
         distribution, decisions, log_prob = self._draw_decisions()
+        if not getattr(self.policy, "sampling", Sampling()).is_full:
+            raise _NotApplicable("the model excludes decisions, and the KL is over those that are left")
         reference = self._decide_first(self.reference)
         # KL(p || q) is the mean of log p - log q over draws from p
         ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(log_prob, decisions)])

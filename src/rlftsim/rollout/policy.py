@@ -59,7 +59,11 @@ AnyPolicy = TypeVar("AnyPolicy")
 
 @dataclass(frozen=True)
 class Sampling:
-    """Temperature and truncation of the draws. RL samples with the defaults, so that the estimator is unbiased."""
+    """Temperature and truncation of the draws. RL samples with the defaults, so that the estimator is unbiased.
+
+    A model may have a sampling of its nature, as those trained with label smoothing need it. That is a part of what it
+    is: draws, log-probability, KL and entropy are under it, and a second one narrows it.
+    """
 
     temperature: float = 1.0
     """Below 1 likely decisions become likelier, as the density is raised to 1 / temperature; 0 always takes the most
@@ -80,6 +84,11 @@ class Sampling:
     def is_full(self) -> bool:
         """True if the whole, untempered distribution is sampled."""
         return self.temperature == 1.0 and self.top_k is None
+
+    def narrow(self, sampling: "Sampling") -> "Sampling":
+        """Both at once: the product of the temperatures, and the smaller number of decisions."""
+        top_k = min((k for k in (self.top_k, sampling.top_k) if k is not None), default=None)
+        return Sampling(self.temperature * sampling.temperature, top_k)
 
 
 @runtime_checkable

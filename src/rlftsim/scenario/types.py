@@ -292,14 +292,14 @@ class Scenario:
             )
 
     def check_array_shapes(self) -> None:
-        """Check that tracks, map and lights hold arrays with the axes that the classes declare.
+        """Check that tracks, map, lights and the scenario itself hold arrays with the axes that the classes declare.
 
         Raises:
             DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
         features = self.map_features
-        tables = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
-        for name, table in tables.items():
+        tables = {"scenario": self, "tracks": self.tracks, "map": features, "topology": features.topology}
+        for name, table in (tables | {"lights": self.lights}).items():
             _check_shapes(table, name)
 
     def check_consistency(self) -> None:

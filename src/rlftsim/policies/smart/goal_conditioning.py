@@ -212,7 +212,8 @@ class GoalLogitBias(nn.Module):
         bias = self(features, num_left[rows], row_class)  # [g, V]
         # tokens of other classes stay impossible
         is_biased = vocabulary.token_mask[row_class] & has_goal[conditioned, None]
-        return TokenDistribution(dist.logits.index_add(0, conditioned, bias.masked_fill(~is_biased, 0.0)), dist.mask)
+        logits = dist.logits.index_add(0, conditioned, bias.masked_fill(~is_biased, 0.0))
+        return TokenDistribution(logits, dist.mask, dist.sampling)
 
 
 @torch.no_grad()

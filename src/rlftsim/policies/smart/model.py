@@ -30,6 +30,7 @@ from rlftsim.policies.smart.embeddings import ClassHeads
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
 from rlftsim.policies.smart.network import Scene, SmartNetwork
 from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
+from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
@@ -49,8 +50,15 @@ class SmartModel(nn.Module):
 
     architecture = "smart"
 
-    def __init__(self, config: SmartConfig, vocabulary: Vocabulary):
+    sampling: Sampling = Sampling()
+    """Truncation of all draws by the model, kept in config.json; see `rollout.policy.Sampling`."""
+
+    def __init__(self, config: SmartConfig, vocabulary: Vocabulary, sampling: Sampling = Sampling()):  # noqa: B008
         super().__init__()
+        if sampling.temperature == 0:
+            raise ConfigError("a model's sampling has a temperature above 0: ask for the mode where it simulates.")
+        if not sampling.is_full:  # else the fingerprint is that of a model without
+            self.sampling = sampling
         self.config = config
         self.vocabulary = vocabulary
         # numbers of tokens that exist, by class
@@ -107,7 +115,7 @@ class SmartModel(nn.Module):
                 "--vocabulary out."
             )
         tokens = self.vocabulary if vocabulary is None else align_vocabulary(vocabulary, self.vocabulary, keep=keep)
-        model = type(self)(config, tokens)
+        model = type(self)(config, tokens, self.sampling)
         load_strictly(model, self.state_dict(), source="the model to train further")
         return model
 
@@ -132,7 +140,7 @@ class SmartModel(nn.Module):
         config = self.config.with_goal_conditioning(encoding, logit_bias)
         if config == self.config:
             return self
-        policy = type(self)(config, self.vocabulary).to(next(self.parameters()).device)
+        policy = type(self)(config, self.vocabulary, self.sampling).to(next(self.parameters()).device)
         # distance and bearing of a goal start from the trained embedding of those of map tokens
         decoder = policy.network.decoder
         if isinstance(decoder.goal, GoalEmbedding):
@@ -174,7 +182,8 @@ class SmartModel(nn.Module):
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.vocabulary.to("cpu").save(Path(folder) / VOCABULARY)
         card = card or "A SMART traffic model. Origin unknown.\n"
-        save_model(folder, self, asdict(self.config), card=card, weights=self.network.state_dict())
+        config = asdict(self.config) | ({} if self.sampling.is_full else {"sampling": asdict(self.sampling)})
+        save_model(folder, self, config, card=card, weights=self.network.state_dict())
 
     @classmethod
     def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
@@ -186,12 +195,13 @@ class SmartModel(nn.Module):
                 the first are named.
         """
         model = read_model(folder, architecture=cls.architecture)
+        sampling = model.pop("sampling", Sampling)
         config, weights = model.build(SmartConfig), model.read_weights()
         path = model.folder / VOCABULARY
         if not path.exists():
             raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
         vocabulary = Vocabulary.load(path)
-        return load_network(lambda: cls(config, vocabulary), weights, source=model.folder)
+        return load_network(lambda: cls(config, vocabulary, sampling), weights, source=model.folder)
 
     # ---- parts of a forward pass ----------------------------------------------------------------------------------
 
@@ -212,7 +222,7 @@ class SmartModel(nn.Module):
         class_id = token_class[scenario, agent]  # [R]
         head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):
-            return TokenDistribution(head(x, class_id).masked_fill(~exists[class_id], NEVER), mask)
+            return TokenDistribution(head(x, class_id).masked_fill(~exists[class_id], NEVER), mask, self.sampling)
         *first, last = head
         assert isinstance(last, nn.Linear)
         hidden, weight = nn.Sequential(*first)(x[:, : self.config.dim]), last.weight
@@ -222,4 +232,4 @@ class SmartModel(nn.Module):
             last_phase = x[:, self.config.dim :]
             hidden = torch.cat([hidden, scores.queries(hidden, last_phase, class_id)], -1)
             weight = torch.cat([weight, scene.token_keys.keys], -1)
-        return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)
+        return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask, self.sampling)

@@ -176,7 +176,7 @@ class SmartPolicy(SmartModel):
             mask = torch.ones_like(mask)
         features = pick_rows(self._compute_features(context, state), mask, is_dense=context.is_padded)
         dist = self._build_distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
-        return TokenDistribution(dist.logits, mask)
+        return TokenDistribution(dist.logits, mask, dist.sampling)
 
     def advance(
         self, context: Context, state: State, decision: Int64[Tensor, "B N A"], forced: AgentStates | None = None
