@@ -1,6 +1,7 @@
 """Validation during training: the numbers of an evaluation, and not a trace in the weights."""
 
 import math
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 
 import tiny
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
@@ -44,46 +45,89 @@ def test_validation_changes_nothing_of_the_training(stage, vocabulary, drawn_sce
         assert "validation_rmm" not in other
 
 
-def find_best(run):
-    """Update of the highest lower bound among the validations of a run."""
-    lines = [line for line in read_metrics(run) if "validation_gain_low" in line]
-    return max(lines, key=lambda line: line["validation_gain_low"])["update"]
-
-
 def test_a_fine_tuned_model_is_that_of_the_best_validation_also_where_the_run_was_stopped(
     vocabulary, drawn_scenarios, held_out, tmp_path, monkeypatch
 ):
-    # steps so large that later models are worse
-    options = {
-        "held_out": held_out, "learning_rate": 0.3, "epochs": 1.0, "max_kl": 1e3, "warmup_updates": 0,
-        "validation": ValidationConfig(every=1, num_scenarios=3, num_rollouts=2, keep_best=True),
-    }  # fmt: skip
-    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "whole", **options)
-    best, last = find_best(tmp_path / "whole"), read_metrics(tmp_path / "whole")[-1]["update"]
-    assert best < last
-    model = load_file(tmp_path / "whole" / "model" / "model.safetensors")
-    kept = load_file(tmp_path / "whole" / "best" / f"update-{best:08d}.safetensors")
-    assert all(torch.equal(value, kept[f"network.{name}"]) for name, value in model.items())
-    # the same model where the run stops behind its best validation and goes on
-    monkeypatch.setattr(TrainingRun, "keep_best", stop_behind(TrainingRun.keep_best, best))
-    arguments = ("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "stopped")
-    with pytest.raises(KeyboardInterrupt):
-        tiny.train(*arguments, **options)
-    monkeypatch.undo()
-    tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "stopped", **options)
-    resumed = load_file(tmp_path / "stopped" / "model" / "model.safetensors")
-    assert all(torch.equal(value, resumed[name]) for name, value in model.items())
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingRun, "keep_best", scripted())
+        whole = train_keeping_best(vocabulary, drawn_scenarios, held_out, tmp_path / "whole")
+        assert read_metrics(tmp_path / "whole")[-1]["update"] == 4
+        # superseded weights are gone
+        assert [path.name for path in (tmp_path / "whole" / "best").iterdir()] == ["update-00000002.safetensors"]
+        kept = load_file(tmp_path / "whole" / "best" / "update-00000002.safetensors")
+        assert all(torch.equal(value, kept[f"network.{name}"]) for name, value in whole.items())
+    # the same model where the run stops behind its best validation, or a later one, and goes on
+    for update in (2, 3):
+        with monkeypatch.context() as patch:
+            patch.setattr(TrainingRun, "keep_best", scripted(stop=update))
+            with pytest.raises(KeyboardInterrupt):
+                train_keeping_best(vocabulary, drawn_scenarios, held_out, tmp_path / "stopped")
+            patch.setattr(TrainingRun, "keep_best", scripted())
+            resumed = train_keeping_best(vocabulary, drawn_scenarios, held_out, tmp_path / "stopped")
+        assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
+        shutil.rmtree(tmp_path / "stopped")
 
 
-def stop_behind(keep_best, update):
-    """A `keep_best` behind which the process ends at an update."""
+KEEP_BEST = TrainingRun.keep_best
+BOUNDS = {1: 0.0, 2: 0.3, 3: -0.1, 4: 0.2}
 
-    def stopped(run, values):
-        keep_best(run, values)
-        if run.learner.update == update:
+
+def scripted(stop=0):
+    """A `keep_best` of validations with the gains `BOUNDS`, behind which the process ends at an update."""
+
+    def keep(run, values):
+        values["validation_gain_low"] = BOUNDS[run.learner.update]
+        KEEP_BEST(run, values)
+        if run.learner.update == stop:
             raise KeyboardInterrupt
 
-    return stopped
+    return keep
+
+
+def train_keeping_best(vocabulary, scenarios, held_out, out, **changes):
+    """Weights of the model of a run of four updates, each with a validation and a checkpoint."""
+    validation = ValidationConfig(every=1, num_scenarios=3, num_rollouts=2, keep_best=True)
+    options = {"held_out": held_out, "epochs": 1.0, "validation": validation, "checkpoint_every": 1} | changes
+    tiny.train("finetune", tiny.tiny_policy(vocabulary), scenarios, out, **options)
+    return load_file(out / "model" / "model.safetensors")
+
+
+def test_what_the_best_model_depends_on_cannot_change_when_a_run_goes_on(
+    vocabulary, drawn_scenarios, held_out, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(TrainingRun, "keep_best", scripted(stop=3))
+    arguments = (vocabulary, drawn_scenarios)
+    with pytest.raises(KeyboardInterrupt):
+        train_keeping_best(*arguments, held_out, tmp_path)
+    same = ValidationConfig(every=1, num_scenarios=3, num_rollouts=2, keep_best=True)
+    for changed, data, name in (
+        (replace(same, num_scenarios=2), held_out, r"validation\.num_scenarios"),
+        (replace(same, keep_best=False), held_out, r"validation\.keep_best"),
+        (same, [held_out[i] for i in range(3, 7)], "held_out"),
+    ):
+        with pytest.raises(CheckpointError, match=rf"other settings or inputs \({name}\)"):
+            train_keeping_best(*arguments, data, tmp_path, validation=changed)
+    # what changes no number may change; but weights that are lost cannot be the model
+    monkeypatch.setattr(TrainingRun, "keep_best", scripted())
+    (tmp_path / "best" / "update-00000002.safetensors").unlink()
+    with pytest.raises(CheckpointError, match=r"update-00000002\.safetensors is missing, the weights of the best"):
+        train_keeping_best(*arguments, held_out, tmp_path, validation=replace(same, scenarios_per_pass=1))
+
+
+def test_the_best_is_not_chosen_by_a_single_scenario(vocabulary, drawn_scenarios, held_out, tmp_path):
+    with pytest.raises(ConfigError, match="a single scenario does not tell the best model"):
+        train_keeping_best(vocabulary, drawn_scenarios, [held_out[0]], tmp_path)
+
+
+def test_a_run_says_where_no_validation_is_better_than_the_start(
+    vocabulary, drawn_scenarios, held_out, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr(TrainingRun, "keep_best", scripted())
+    monkeypatch.setitem(BOUNDS, 2, -0.2)
+    monkeypatch.setitem(BOUNDS, 4, -0.3)
+    train_keeping_best(vocabulary, drawn_scenarios, held_out, tmp_path)
+    assert "no validation is clearly better than the start" in caplog.text
+    assert "of update 1: the lower bound of its gain in RMM over the start, +0.0000" in caplog.text
 
 
 def test_the_gain_is_over_the_start_scenario_by_scenario(vocabulary, drawn_scenarios, held_out, tmp_path):

@@ -32,6 +32,15 @@ def test_the_best_validation_is_listed_with_its_update(tmp_path):
     assert (run.measure, run.best, run.last, run.num_updates) == ("validation_rmm", (2, 0.74), 0.72, 4)
 
 
+def test_the_best_is_the_validation_whose_weights_are_the_model(tmp_path):
+    scores = [
+        {"validation_rmm": 0.74, "validation_gain_low": 0.01},
+        {"validation_rmm": 0.75, "validation_gain_low": 0.0},
+    ]
+    (run,) = runs([str(write_run(tmp_path / "a", {"seed": 0}, scores))])
+    assert run.best == (1, 0.74)
+
+
 def test_training_batches_have_a_mean_of_the_last_tenth_and_no_best(tmp_path):
     batches = [{"rmm": 0.9}] + [{"rmm": 0.5}] * 17 + [{"rmm": 0.7}, {"rmm": 0.6}]
     (run,) = runs([str(write_run(tmp_path / "a", {"seed": 0}, batches))])
@@ -48,7 +57,7 @@ def test_only_settings_that_differ_are_shown_and_none_that_changes_no_result(tmp
     (tmp_path / "notes.txt").write_text("no run")
     assert main(["runs", *folders, str(tmp_path / "notes.txt")]) == 0
     table, differences = capsys.readouterr().out.split("setting")
-    assert "not finished" in table
+    assert [line.split("│")[2].strip() for line in table.splitlines() if line.startswith("│")] == ["yes", "no"]
     assert "seed" in differences
     assert "kl.target" not in differences
 

@@ -135,7 +135,8 @@ class ValidationConfig:
     """Of the choice and of the rollouts, the same at every validation."""
     keep_best: bool = False
     """The model of the run is that of the best validation: of the highest lower bound (95 %, one-sided) of its gain in
-    RMM over the start, scenario by scenario. False = the model of the last update."""
+    RMM over the start, scenario by scenario. As the best of several bounds it promises too much: report the gain on
+    other scenarios. False = the model of the last update."""
 
     def __post_init__(self) -> None:
         check_types(self)

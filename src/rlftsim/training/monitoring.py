@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.progress import log
 from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -167,12 +168,15 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
         config: Settings of the validation, of which sampling is tried.
 
     Raises:
-        ConfigError: the model cannot simulate, or not with this sampling, or there is no scenario.
+        ConfigError: The model cannot simulate, or not with this sampling, or there is no scenario, or a single one to
+            choose the best model by.
     """
     if not isinstance(model, Policy):
         raise ConfigError(f"{type(model).__name__} cannot simulate, so it cannot be validated: set validation.every=0.")
     if not len(scenarios):
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
+    if config.keep_best and len(config.choose(len(scenarios))) < 2:
+        raise ConfigError("a single scenario does not tell the best model: validate on more, or set keep_best=False.")
     if config.top_k is not None:
         frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
         check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
@@ -195,6 +199,8 @@ class Validator:
         self._scenarios, self.config, self._fabric = scenarios, config, fabric
         clusters = getattr(scenarios, "clusters", np.arange(len(scenarios)))  # lists of scenarios name none
         self._clusters = np.array(clusters)[config.choose(len(scenarios))]
+        if start is not None and len(set(self._clusters)) == 1 and fabric.is_global_zero:
+            log.warning("all scenarios of the validation are of one street network: gains hold for it alone.")
         self._start = None if start is None else validate(start, scenarios, config, fabric)[1]
 
     def validate(self, model: nn.Module) -> dict[str, float]:

@@ -21,7 +21,6 @@ from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
-from rlftsim.training.config import ValidationConfig
 from rlftsim.training.data import share_cache
 from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
 from rlftsim.training.monitoring import Validator, check_validation
@@ -116,19 +115,19 @@ def _make_updates(
     Ctrl-C waits for the end of an update, which becomes a checkpoint.
     """
     scenarios = share_cache(scenarios, num_sharing_memory(fabric))
-    validation: ValidationConfig | None = None if held_out is None else settings.validation
-    if held_out is not None and validation is not None and validation.every:
-        check_validation(policy, held_out, validation)
+    if held_out is not None and settings.validation.every:
+        check_validation(policy, held_out, settings.validation)
     else:
-        validation = None
+        held_out = None
     learner = method.start(policy, scenarios, settings, fabric)
     update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     with _hold_folder(out, fabric):
-        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric)
+        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric, held_out)
         validator = None
-        if held_out is not None and validation is not None:
+        if held_out is not None:
             # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
-            validator = Validator(held_out, validation, fabric, learner.result if validation.keep_best else None)
+            start = learner.result if settings.validation.keep_best else None
+            validator = Validator(held_out, settings.validation, fabric, start)
         run.resume()
         with run.progress() as is_stopped:
             note = ""
@@ -189,11 +188,13 @@ class TrainingRun:
     identity."""
     fabric: Fabric
     """Device and processes; only rank 0 writes files."""
+    held_out: Scenarios | None = None
+    """Scenarios to validate on."""
 
     def __post_init__(self) -> None:
         learner, is_first = self.learner, self.fabric.is_global_zero
         self.num_updates = self.settings.num_updates(len(self.scenarios))
-        inputs = {**describe_inputs(learner.policy, self.scenarios), **learner.inputs}
+        inputs = {**describe_inputs(learner.policy, self.scenarios, self.held_out), **learner.inputs}
         self.folder = RunFolder(self.out, self.settings, inputs, writes=is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
         self._best: tuple[float, int] | None = None
@@ -227,7 +228,8 @@ class TrainingRun:
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
         for values in read_metrics(self.folder.path):
-            self._choose_best(values)
+            if values["update"] <= learner.update:  # the process of rank 0 may not have dropped the others yet
+                self._choose_best(values)
         if self.fabric.is_global_zero and learner.update < self.num_updates:
             for name, value in self.folder.grows_from.items():
                 log.info(f"{self.folder.model} stays the model of {value:g} {name} until the run ends.")
@@ -305,6 +307,7 @@ class TrainingRun:
             numbers = learner.to_numbers() | ({STOPPED: 1.0} if report.stop_because else {})
             progress = Progress(learner.update, numbers)
             write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
+            self.folder.remove_superseded_best()
         self._advance(note=report.note)
 
     def _check_divergence(self, report: UpdateReport, *, has_checked_weights: bool) -> None:
@@ -338,17 +341,19 @@ class TrainingRun:
 
     def _take_best(self) -> None:
         """Load the weights of the best validation, where one was kept and later updates were made."""
-        learner = self.learner
-        if self._best is None or self._best[1] == learner.update:
+        if self._best is None:
             return
         bound, update = self._best
-        if not self.folder.load_best(update, learner.result):
+        if update != self.learner.update:
+            self.folder.load_best(update, self.learner.result)
+        if not self.fabric.is_global_zero:
             return
-        if self.fabric.is_global_zero:
-            log.info(
-                f"{self.folder.model} is the model of update {update}: its gain in RMM over the start is at least "
-                f"{bound:+.4f} (95 %, one-sided)."
-            )
+        log.info(
+            f"{self.folder.model} is the model of update {update}: the lower bound of its gain in RMM over the start, "
+            f"{bound:+.4f}, is the highest of all validations."
+        )
+        if bound <= 0:
+            log.warning("no validation is clearly better than the start: evaluate both before you take this model.")
 
 
 def _count_weights(learner: Learner) -> str:

@@ -51,6 +51,10 @@ MAY_CHANGE = (
 (The folder of augmented goals may change; the goals themselves are among a run's inputs.)"""
 
 
+DECIDES_BEST = ("every", "keep_best", "metric", "num_rollouts", "num_scenarios", "seed", "top_k")
+"""Settings of a validation on which the choice of the best model depends."""
+
+
 def may_change(name: str) -> bool:
     """True for a setting, named with dots, that may have a different value when a run is resumed."""
     return any(name == free or name.startswith(f"{free}.") for free in MAY_CHANGE)
@@ -70,7 +74,9 @@ BOARD_GROUPS = {
 
 SCENARIO_FILES = "scenario_files"
 """Input that only data sets have, not lists of scenarios, and not runs of before: compared where both have it."""
-RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, "augmented_goals")
+HELD_OUT = "held_out"
+"""Input that only runs with validations have."""
+RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, HELD_OUT, "augmented_goals")
 """Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
 
 
@@ -80,27 +86,34 @@ def board_tag(name: str) -> str:
     return "/".join([*groups, name])
 
 
-def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
+def describe_inputs(policy: object, scenarios: Scenarios, held_out: Scenarios | None = None) -> dict[str, str]:
     """Hashes of the inputs that a run starts from.
 
     Args:
         policy: Policy with the weights, settings and vocabulary to hash.
         scenarios: Scenarios with the ids and order to hash, or a data set with files to hash, too.
+        held_out: Scenarios to validate on, of which the ids are hashed; None = no validation.
     """
+    inputs = {"initial_policy": fingerprint_policy(policy), "scenarios": _hash_ids(scenarios)}
+    if isinstance(scenarios, ScenarioDataset):
+        inputs[SCENARIO_FILES] = scenarios.fingerprint
+    return inputs if held_out is None else inputs | {HELD_OUT: _hash_ids(held_out)}
+
+
+def _hash_ids(scenarios: Scenarios) -> str:
+    """Hash of the scenarios' ids; not of the scenarios themselves, which would take minutes to read."""
     ids = hashlib.blake2b(digest_size=16)
-    # Not the scenarios themselves: reading every one would take minutes.
     for scenario_id in list_scenario_ids(scenarios):
         ids.update(f"{scenario_id}\n".encode())
-    files = {SCENARIO_FILES: scenarios.fingerprint} if isinstance(scenarios, ScenarioDataset) else {}
-    return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest(), **files}
+    return ids.hexdigest()
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted name.
 
     Args:
-        values: mappings at any depth.
-        prefix: put before every name.
+        values: Mappings at any depth.
+        prefix: Text before every name.
     """
     flat: dict[str, Any] = {}
     for name, value in values.items():
@@ -112,7 +125,7 @@ def stored_settings(path: Path) -> dict[str, Any]:
     """Settings and inputs of the run in a folder, empty where no run has begun.
 
     Raises:
-        CheckpointError: the file of settings is damaged.
+        CheckpointError: The file of settings is damaged.
     """
     file = path / "config.json"
     try:
@@ -153,14 +166,14 @@ class RunFolder:
 
     Args:
         path: Folder of the run, created if missing.
-        config: a dataclass of settings.
-        inputs: hashes of the run's inputs, see `describe_inputs`.
+        config: Dataclass of the run's settings.
+        inputs: Hashes of the run's inputs, see `describe_inputs`.
         writes: False in all processes but rank 0.
-        may_grow: settings of the top level that may be raised when the folder is opened again, such as epochs where
+        may_grow: Settings of the top level that may be raised when the folder is opened again, such as epochs where
             no update depends on the run's end.
 
     Raises:
-        CheckpointError: the folder belongs to a run with other settings or inputs.
+        CheckpointError: The folder belongs to a run with other settings or inputs.
     """
 
     def __init__(
@@ -182,8 +195,8 @@ class RunFolder:
         # Settings and inputs stand in one file: both make a run what it is.
         self._settings = {**to_plain(config), **(inputs or {})}
         stored = self._checked_stored_settings(self._settings, may_grow)
-        if stored.get(SCENARIO_FILES):  # kept where the same scenarios come as a list this time
-            self._settings.setdefault(SCENARIO_FILES, stored[SCENARIO_FILES])
+        # kept where the same scenarios come as a list this time, or without a validation
+        self._settings = {name: stored[name] for name in (SCENARIO_FILES, HELD_OUT) if name in stored} | self._settings
         changed = {name: stored[name] for name in may_grow if name in stored and stored[name] != self._settings[name]}
         self.grows_from = changed if self.has_model else {}
         """Settings of the shorter run whose model is here, by name; empty unless it is made longer."""
@@ -199,31 +212,40 @@ class RunFolder:
         """Keep the weights of the best validation so far.
 
         Args:
-            update: Number of updates behind which they were validated.
+            update: Number of updates before the validation.
             model: Module with the weights.
         """
         save_tensors(self._best(update), model.state_dict())
 
-    def load_best(self, update: int, model: nn.Module) -> bool:
-        """Load kept weights in place; False where an earlier start of the run had validated without keeping them.
+    def load_best(self, update: int, model: nn.Module) -> None:
+        """Load kept weights in place.
 
         Args:
-            update: Number of updates behind which they were validated.
+            update: Number of updates before the validation.
             model: Module that gets the weights.
 
         Raises:
-            CheckpointError: Damaged file, or weights of a different module.
+            CheckpointError: Missing or damaged file, or weights of a different module.
         """
         path = self._best(update)
+        way_out = f"remove {self.path} and train again"
         try:
-            weights, _ = read_tensors(path, "remove it and train again", error=CheckpointError)
+            weights, _ = read_tensors(path, way_out, error=CheckpointError)
             _check_weights(path.stem, weights, model)
         except FileNotFoundError:
-            return False
+            raise CheckpointError(f"{path} is missing, the weights of the best validation: {way_out}.") from None
         except ValueError as error:
-            raise CheckpointError(f"{path}: {error}: remove it and train again.") from None
+            raise CheckpointError(f"{path}: {error}: {way_out}.") from None
         model.load_state_dict(weights)
-        return True
+
+    def remove_superseded_best(self) -> None:
+        """Remove the weights of validations that were the best once, but are so for no checkpoint of the folder."""
+        paths = sorted((self.path / "best").glob("update-*.safetensors"))
+        checkpoints = [self._best(parse_update(path)) for path in _checkpoints(self.checkpoints)]
+        needed = {max((path for path in paths if path <= checkpoint), default=None) for checkpoint in checkpoints}
+        for path in paths:
+            if path not in needed and path < max(checkpoints):
+                path.unlink(missing_ok=True)
 
     def _best(self, update: int) -> Path:
         return self.path / "best" / f"update-{update:08d}.safetensors"
@@ -251,9 +273,12 @@ class RunFolder:
             raise CheckpointError(
                 f"{self.path} belongs to a run of another kind: name another --out, or remove the folder to start anew."
             )
-        one_sided = {SCENARIO_FILES} - (old.keys() & new.keys())
+        one_sided = {SCENARIO_FILES, HELD_OUT} - (old.keys() & new.keys())
         grown = {name for name in may_grow if isinstance(old.get(name), int | float) and new[name] > old[name]}
-        names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown - one_sided
+        decisive = {f"validation.{name}" for name in DECIDES_BEST} | {HELD_OUT}
+        if not (old.get("validation.every") and old.get("validation.keep_best")):
+            one_sided, decisive = one_sided | {HELD_OUT}, set()
+        names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown - one_sided | decisive
         differing = sorted(name for name in names if old.get(name) != new.get(name))
         if differing:
             max_names = 8  # settings named in one line
@@ -269,8 +294,8 @@ class RunFolder:
         """The error of a run that makes no sense any more; names the last good checkpoint.
 
         Args:
-            cause: clause that follows the folder's name.
-            remedy: clause with the settings to change.
+            cause: Clause that follows the folder's name.
+            remedy: Clause with the settings to change.
         """
         newest = newest_checkpoint(self.checkpoints)
         return CheckpointError(f"{self.path}: {cause}. The last good checkpoint is {newest or 'none'}: {remedy}.")
@@ -354,13 +379,13 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
     """Write a checkpoint of a run into `folder` and remove all but the newest.
 
     Args:
-        folder: the run's folder of checkpoints.
-        progress: position of the run.
-        modules: weights by file name, such as policy and reference.
+        folder: Folder of the run's checkpoints.
+        progress: Position of the run.
+        modules: Weights by file name, such as policy and reference.
         optimizer: Optimizer with the moments to store, too.
 
     Raises:
-        DataError: a file cannot be written, such as on a full disk; names it. Older checkpoints are untouched.
+        DataError: A file cannot be written, such as on a full disk; names it. Older checkpoints are untouched.
     """
     target = folder / f"{PREFIX}{progress.update:08d}"
     partial = folder / f".partial-{target.name}"

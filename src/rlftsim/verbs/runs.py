@@ -15,22 +15,23 @@ from rlftsim.jobs.folder import recognize_folder
 from rlftsim.jobs.progress import print_wide
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, may_change, read_metrics, stored_settings
 
-VALIDATION = "validation_rmm"
+VALIDATION, BOUND = "validation_rmm", "validation_gain_low"
 MEASURES = (VALIDATION, "rmm", "loss", "imitation_loss")
 """Metrics that say how good a model is, the most telling first; losses are better where they are lower."""
 NO_VALUE = "–"
 
 
 @dataclass(frozen=True)
-class TrainingRun:
-    """A run of any training method, finished or not."""
+class RunSummary:
+    """Results of a run of any training method, finished or not."""
 
     folder: Path
     settings: Mapping[str, Any]
     """Settings by dotted name, and hashes of the inputs; without those that change no result."""
     metrics: Sequence[Mapping[str, Any]]
     """Metrics of each update, as in metrics.jsonl."""
-    is_finished: bool
+    has_model: bool
+    """False = the run has not finished. A run that is made longer has the model of the shorter one until it ends."""
 
     @property
     def num_updates(self) -> int:
@@ -52,16 +53,18 @@ class TrainingRun:
 
     @property
     def best(self) -> tuple[int, float] | None:
-        """Update with the best validation, and its value. The best of many training batches would be luck."""
-        values = self._read_measure() if self.measure == VALIDATION else []
-        return max(values, key=lambda pair: pair[1], default=None)
+        """Update with the best validation, and its RMM: the one whose weights are the model, where the run keeps these.
+        The best of many training batches would be luck."""
+        values = [line for line in self.metrics if self.measure == VALIDATION and VALIDATION in line]
+        best = max(values, key=lambda line: line.get(BOUND, line[VALIDATION]), default=None)
+        return best and (int(best["update"]), float(best[VALIDATION]))
 
     def _read_measure(self) -> list[tuple[int, float]]:
         name = self.measure
         return [(int(line["update"]), float(line[name])) for line in self.metrics if name is not None and name in line]
 
 
-def runs(folders: list[str]) -> list[TrainingRun]:
+def runs(folders: list[str]) -> list[RunSummary]:
     """List training runs: how far they are, how good, and which settings differ.
 
     Example: `rlftsim runs runs/*`
@@ -86,7 +89,7 @@ def runs(folders: list[str]) -> list[TrainingRun]:
     return listed
 
 
-def read_run(folder: Path) -> TrainingRun:
+def read_run(folder: Path) -> RunSummary:
     """The run in a folder.
 
     Raises:
@@ -95,10 +98,10 @@ def read_run(folder: Path) -> TrainingRun:
     stored = stored_settings(folder)
     settings = {name: value for name, value in flatten(stored).items() if not may_change(name)}
     settings |= {name: stored[name][:8] for name in RUN_INPUTS if isinstance(stored.get(name), str)}
-    return TrainingRun(folder, settings, read_metrics(folder), (folder / "model" / "config.json").exists())
+    return RunSummary(folder, settings, read_metrics(folder), (folder / "model" / "config.json").exists())
 
 
-def find_differences(training_runs: Sequence[TrainingRun]) -> dict[str, list[str]]:
+def find_differences(training_runs: Sequence[RunSummary]) -> dict[str, list[str]]:
     """Settings in which runs differ, by name: the value of each run as text.
 
     Args:
@@ -112,7 +115,7 @@ def find_differences(training_runs: Sequence[TrainingRun]) -> dict[str, list[str
     return rows
 
 
-def print_runs(training_runs: list[TrainingRun]) -> None:
+def print_runs(training_runs: list[RunSummary]) -> None:
     """Print a table of runs, and one of the settings in which they differ.
 
     Args:
@@ -120,13 +123,20 @@ def print_runs(training_runs: list[TrainingRun]) -> None:
     """
     names = _shorten_names([run.folder for run in training_runs])
     table = Table()
-    for heading in ("run", "state", "updates", "metric", "last", "best", "at update"):
-        table.add_column(heading, justify="left" if heading in ("run", "state", "metric") else "right", overflow="fold")
+    for heading in ("run", "model", "updates", "metric", "last", "best", "at update"):
+        table.add_column(heading, justify="left" if heading in ("run", "model", "metric") else "right", overflow="fold")
     for name, run in zip(names, training_runs):
         update, best = run.best or (NO_VALUE, None)
-        state = "finished" if run.is_finished else "not finished"
         measure = run.measure or NO_VALUE
-        table.add_row(name, state, str(run.num_updates), measure, _format(run.last), _format(best), str(update))
+        table.add_row(
+            name,
+            "yes" if run.has_model else "no",
+            str(run.num_updates),
+            measure,
+            _format(run.last),
+            _format(best),
+            str(update),
+        )
     differences = Table("setting", *names)
     for name, values in find_differences(training_runs).items():
         differences.add_row(name, *values)
