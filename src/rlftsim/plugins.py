@@ -69,12 +69,12 @@ class ExtensionPoint(Generic[Value]):
         """Add a thing under a name, in place of an earlier one from outside this package.
 
         Args:
-            name: to look it up by.
-            value: the thing.
-            stacklevel: frames up to the line that the warning points to, as in `warnings.warn`.
+            name: Name to look the value up by.
+            value: Function, class or other object to register.
+            stacklevel: Number of frames up to the line that the warning points to, as in `warnings.warn`.
 
         Raises:
-            ConfigError: the name is taken by a thing that ships with this package.
+            ConfigError: The name is taken by a thing that ships with this package.
         """
         # A module of this package registers its things by the same decorator, and may be reloaded.
         known = self._registered.get(name)

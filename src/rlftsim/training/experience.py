@@ -42,7 +42,7 @@ class Experience:
         """Yield this process's rollouts of every scenario with each agent's rewards.
 
         Args:
-            size: rollouts of a scenario at a time, so that few are in memory with gradients.
+            size: Number of rollouts of a scenario at a time, so that few are in memory with gradients.
         """
         rollout_ids = self.rollout_ids or range(self.rollouts.num_rollouts)
         for start in rollout_ids[::size]:

@@ -96,7 +96,7 @@ class Running:
 
         Args:
             value: Value of the statistic in that update; not counted where not finite.
-            config: number of first updates and window.
+            config: Number of first updates and window.
         """
         if not math.isfinite(value):
             return self
@@ -118,7 +118,7 @@ class Alarms:
         """Take in the statistics of an update.
 
         Args:
-            logged: metrics of the update, by name.
+            logged: Metrics of the update, by name.
             config: Thresholds of the alarms, and the lengths of both means in updates.
 
         Returns:
@@ -309,7 +309,7 @@ class MapUse:
         NaN where there was no such token.
 
         Args:
-            prefix: put before every name.
+            prefix: Text before every name.
         """
         count, with_map, without = self.sums.T  # [2] each
         values = {"loss": with_map / count, "map_use": (without - with_map) / count}

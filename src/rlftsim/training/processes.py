@@ -142,7 +142,7 @@ class LinkedProcess:
         """Sum of a tensor over all processes, the same bits in each process and in each run.
 
         Args:
-            data: this process's summand.
+            data: Summand of this process.
             reduce_op: "sum".
 
         Raises:
