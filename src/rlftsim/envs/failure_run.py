@@ -157,8 +157,10 @@ def _build(cls: type[Value], values: Mapping[str, Any]) -> Value:
     Raises:
         KeyError, TypeError, ValueError: The file was cut or edited.
     """
+    # JSON has lists where the dataclasses have tuples
+    arguments = {field.name: values[field.name] for field in fields(cls)}  # type: ignore[arg-type]
     try:
-        return cls(**{field.name: values[field.name] for field in fields(cls)})  # type: ignore[arg-type]
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items()})
     except ConfigError as error:
         raise ValueError(str(error)) from None
 

@@ -267,7 +267,8 @@ def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
         about = parse_json(read_parquet_metadata(path)[b"rlftsim"], way_out, source=str(path))
         about["scenarios"] = about["scenarios"] and tuple(about["scenarios"])
         check_columns(table, SCHEMA)
-        return StudyConfig(**about), Failure(**table.slice(number, 1).to_pylist()[0])
+        row = table.slice(number, 1).to_pylist()[0]
+        return StudyConfig(**about), Failure(**row | {"dice": tuple(row["dice"])})
     except (ConfigError, DataError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path} is no table of failures ({first_line(error)}): {way_out}.") from None
 
