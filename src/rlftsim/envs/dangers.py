@@ -93,9 +93,10 @@ class StepView:
 
     @property
     def acceleration(self) -> float:
-        """Change of speed over the last step, m/s²; 0 before the first."""
-        before, now = (signed_speed(step[self.index][None])[0] for step in self.state.world.track[-2:])
-        return float(now - before) / STEP_S if self.step else 0.0
+        """Lowest change of speed within a step of the last action, m/s²; 0 before the first."""
+        steps = self.state.world.track[-1 - self.episode.controls.steps :]
+        speed = signed_speed(np.stack([motion[self.index] for motion in steps]))
+        return float(np.diff(speed).min()) / STEP_S if self.step else 0.0
 
     def others(self, reach_m: float = np.inf) -> np.ndarray:
         """Rows of the agents that are there, near and not yet touched."""

@@ -155,8 +155,12 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
     with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
         planner.reset(info)
-        while not env.state.ended[0]:
-            observation, *_ = env.step(planner.act(observation))
+    while not env.state.ended[0]:
+        with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
+            action = planner.act(observation)
+        # of a step of the world only the action is the planner's
+        with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step, errors=(ConfigError,)):
+            observation, *_ = env.step(action)
     return env.result()
 
 

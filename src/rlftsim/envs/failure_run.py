@@ -13,6 +13,7 @@ import numpy as np
 
 from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimate, Study, StudyConfig, share_budget
 from rlftsim.envs.failures import Failure, Repeat
+from rlftsim.envs.planners.registry import PlannerFailure
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.resumable import ScenarioValues
 from rlftsim.jobs.documents import read_json
@@ -117,9 +118,10 @@ def _measure(
 def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict[str, object]:
     episodes = config.chain(ids[position])
     try:
-        episodes.check_start()
+        if problem := episodes.describe_start_event():
+            return asdict(Pilot(ids[position], (), 0.0, 0, problem))
         paths, danger = episodes.start(np.arange(config.pilot))
-    except DataError as error:  # also a planner that fails
+    except PlannerFailure as error:  # other scenarios may be driven
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
     driven_m = float(np.mean([path.driven_m for path in paths]))
     return asdict(

@@ -204,11 +204,14 @@ class FailureChain:
             for row in acts:
                 if block == 0:
                     planners[row] = copy_planner(self.planner)
-                    planners[row].reset(describe_start(episode, state, int(row), self.source))
+                    about = describe_start(episode, state, int(row), self.source)
+                    with guard_planner(self.planner, self.scenario_id, lambda: 0):
+                        planners[row].reset(about)
                 elif block == shared[row]:
                     planners[row] = copy_planner(copies[row].pop())
                 if block == 0 or dice[row, block] != dice[row, block - 1]:
-                    getattr(planners[row], "seed", lambda number: None)(int(dice[row, block]))
+                    with guard_planner(self.planner, self.scenario_id, lambda now=begin: now):
+                        getattr(planners[row], "seed", lambda number: None)(int(dice[row, block]))
                 copies[row].append(copy_planner(planners[row]))
             imposed = np.full((size, self.block_steps, 5), np.nan)
             for row in np.flatnonzero(shared > block):
@@ -258,18 +261,16 @@ class FailureChain:
             for row in range(repeats)
         )
 
-    def check_start(self) -> None:
-        """Check that the event does not hold at the start.
-
-        Raises:
-            DataError: It does.
-        """
+    def describe_start_event(self) -> str:
+        """Text that says that the event holds at the start; empty where it does not."""
         episode = self._episode(1)
-        if self.event.danger(StepView(episode, start(episode, self._dice(np.zeros(1, np.int64))), 0)) >= 0:
-            raise DataError(
-                f"scenario {self.scenario_id}: the event has happened at the start, whatever the planner does: choose "
-                "another scenario or event."
-            )
+        state = start(episode, self._dice(np.zeros(1, np.int64)))
+        if self.event.danger(StepView(episode, state, 0)) < 0:
+            return ""
+        return (
+            f"scenario {self.scenario_id}: the event has happened at the start, whatever the planner does: choose "
+            "another scenario or event."
+        )
 
     def run_again(self, failure: Failure, observe: Callable[[Episode, EpisodeState], None] | None = None) -> Result:
         """The episode of a failure, bit for bit.
@@ -484,5 +485,6 @@ def estimate_failures(
     measured_event = find_event(event)
     source = make_source(driver, scenario, policy, **settings)
     chain = FailureChain(source, driver, scenario.scenario_id, measured_event, seed=seed)
-    chain.check_start()
+    if problem := chain.describe_start_event():
+        raise DataError(problem)
     return FailureEstimate(chain.estimate(particles, repeats), particles, scenario.scenario_id, chain)

@@ -165,13 +165,19 @@ class PlannerFailure(DataError):
 
 
 @contextmanager
-def guard_planner(planner: Planner, scenario_id: str, read_step: Callable[[], int]) -> Iterator[None]:
+def guard_planner(
+    planner: Planner,
+    scenario_id: str,
+    read_step: Callable[[], int],
+    errors: tuple[type[BaseException], ...] = (Exception, SystemExit),
+) -> Iterator[None]:
     """Turn any error of a planner, and exit(), which would end the command as if all were done, into one line.
 
     Args:
         planner: Planner that is called within.
         scenario_id: Scenario for the message.
         read_step: Function that tells the step of the episode for the message.
+        errors: Errors that are the planner's; others pass.
 
     Raises:
         PlannerFailure: The planner raises an error, calls exit(), or wants what its type of action does not allow.
@@ -180,7 +186,7 @@ def guard_planner(planner: Planner, scenario_id: str, read_step: Callable[[], in
         yield
     except MemoryError:  # no fault of the planner
         raise
-    except (Exception, SystemExit) as error:
+    except errors as error:
         cause = f"exit({error.code!r})" if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
         # messages of ours say all that a user needs
         cause = str(error) if isinstance(error, RlftsimError) else f"{cause} ({locate_error(error)})"
