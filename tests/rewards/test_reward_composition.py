@@ -18,7 +18,6 @@ from rlftsim.rewards import (
     reward_by_name,
 )
 from rlftsim.rewards.base import agent_rewards_by_name
-from rlftsim.training import experience as module
 from rlftsim.training.config import FinetuneConfig
 from rlftsim.training.experience import compute_reward
 
@@ -196,7 +195,7 @@ def test_agent_scores_are_not_computed_where_credit_goes_to_rollouts(measured, m
     def refuse(*_):
         raise AssertionError("realism by agent without need")
 
-    monkeypatch.setattr(module, "AgentScores", refuse)
+    monkeypatch.setattr(AgentScores, "_scatter", refuse)
     _, rollouts, scenarios, _ = measured
     assert compute_reward(scenarios, rollouts, FinetuneConfig(reward=EVERYTHING))[1].total.isfinite().all()
 

@@ -89,7 +89,7 @@ def augment_goals(
         goals = _GoalFiles(folder, config.scenarios_per_part)
         groups, work = group_positions(len(scenarios), goals.size), partial(_find_ends, policy, scenarios, config)
         paths = run_items("augment", groups, group_task(work, goals), format=goals, lease=lease, runner=runner)
-        remove_temporaries([folder / "config.json", *paths])  # of processes that were killed
+        remove_temporaries([folder / "config.json", folder / "environment.json", *paths])  # of killed processes
         lease.remove()
     return len(scenarios)
 
