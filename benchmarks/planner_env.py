@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv
-from rlftsim.envs.drive import DriveConfig, drive
+from rlftsim.envs.drive import drive
+from rlftsim.envs.drive_scenario import DriveConfig
 from rlftsim.evaluation.drive_results import compare_drives, format_drives
 from rlftsim.jobs.progress import print_wide
 from rlftsim.policies.registry import load_policy

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from rlftsim.envs import EgoEnv
 from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD
-from rlftsim.envs.drive import run_planner
+from rlftsim.envs.drive_scenario import run_planner
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.sb3 import SB3VecEnv
 from rlftsim.evaluation.compare import compare_paired

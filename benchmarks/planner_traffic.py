@@ -10,7 +10,8 @@ Markdown, the scores and the paired differences between traffics, with 95 % inte
 import argparse
 from pathlib import Path
 
-from rlftsim.envs.drive import DriveConfig, drive
+from rlftsim.envs.drive import drive
+from rlftsim.envs.drive_scenario import DriveConfig
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives
 from rlftsim.statistics import mean_interval
 

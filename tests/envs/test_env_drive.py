@@ -15,14 +15,21 @@ from full_disk import limit_files_to
 from rlftsim.cli import main
 from rlftsim.envs import EgoEnv
 from rlftsim.envs import drive as drive_module
-from rlftsim.envs.drive import DriveConfig, choose_films, drive, run_planner
+from rlftsim.envs.drive import drive
+from rlftsim.envs.drive_scenario import DriveConfig, choose_films, run_planner, write_film
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, compute_idm_acceleration
 from rlftsim.envs.planner_scores import off_road
 from rlftsim.envs.planners.registry import PLANNERS, hash_code, load_planner, read_action_settings
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import resumable
-from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison, rank_scenarios
+from rlftsim.evaluation.drive_results import (
+    DriveResult,
+    compare_drives,
+    find_failures,
+    format_drive_comparison,
+    rank_scenarios,
+)
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.shards import hash_file
@@ -327,14 +334,14 @@ def test_a_result_that_another_drive_finished_meanwhile_is_not_replaced_by_fewer
 
 def test_unfinished_parts_of_other_settings_outlive_a_repeated_drive(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
-    original, calls = drive_module._drive_scenario, []
+    original, calls = drive_module.drive_scenario, []
 
     def second_fails(*arguments):
         calls.append(arguments)
         return original(*arguments) if len(calls) == 1 else 1 / 0
 
     with monkeypatch.context() as patch:
-        patch.setattr(drive_module, "_drive_scenario", second_fails)
+        patch.setattr(drive_module, "drive_scenario", second_fails)
         with pytest.raises(ZeroDivisionError):
             drive(replace(config, seed=1), tmp_path)
     parts = [*(tmp_path / "constant_velocity-replay.parts").glob("*.json")]
@@ -498,23 +505,31 @@ def test_the_worst_scenarios_are_named_with_what_the_planner_does_there(tmp_path
 
 
 def test_a_full_disk_is_noticed_before_anything_is_driven(tmp_path, monkeypatch):
-    monkeypatch.setattr("rlftsim.envs.drive.run_planner", None)
+    monkeypatch.setattr("rlftsim.envs.drive_scenario.run_planner", None)
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
     with limit_files_to(10), pytest.raises(DataError, match=r"cannot write .*\.lock .*: make room or choose another"):
         drive(config, tmp_path / "out")
 
 
-def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch):
+def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch, tmp_path):
     # from the second rollout on a car stands in the planner's way
     rollouts = iter(["free", "blocked", "rammed"])
     movers = {"free": (), "blocked": (Mover(x_m=30.0, speed_mps=0.0),), "rammed": (Mover(x_m=-15.0, speed_mps=15.0),)}
     results = {name: driven("constant_velocity", build_scenario(name, (Mover(), *movers[name]))) for name in movers}
-    monkeypatch.setattr("rlftsim.envs.drive.run_planner", lambda *_, **__: results[next(rollouts)])
+    monkeypatch.setattr("rlftsim.envs.drive_scenario.run_planner", lambda *_, **__: results[next(rollouts)])
     (row,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=3))
     assert row.values("blamed_others_rate")[0] == 0.5
     assert row.values("others_collision_rate")[0] == 0.0  # NaN where the planner is alone
     assert results["free"].planner.least_ttc_s == 3.0
     assert 1.0 < row.values("least_ttc_s")[0] < 3.0
+    # a crash in one rollout of three is a failure, and the film shows that rollout
+    assert find_failures(row) == row.scenario_ids == choose_films([row], "failures")
+    rollouts, filmed = iter(["free", "blocked", "rammed"]), {}
+    monkeypatch.setattr("rlftsim.envs.drive_scenario.build_animation", filmed.update)
+    monkeypatch.setattr("rlftsim.envs.drive_scenario.to_film", lambda *_, **__: None)
+    config = DriveConfig("constant_velocity", traffic=("replay",), num_rollouts=3, film="failures")
+    write_film(config, row.scenario_ids[0], tmp_path)
+    assert filmed == {"constant_velocity in replay": results["blocked"].record}
 
 
 def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
@@ -618,8 +633,8 @@ def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatc
     (whole,) = drive(config, tmp_path / "whole")
     first, second = whole.table["scenario_id"].to_pylist()
     driven = []
-    original = drive_module._drive_scenario
-    monkeypatch.setattr(drive_module, "_drive_scenario", lambda *a: driven.append(a[-1]) or original(*a))
+    original = drive_module.drive_scenario
+    monkeypatch.setattr(drive_module, "drive_scenario", lambda *a: driven.append(a[-1]) or original(*a))
     for number, edit in enumerate((
         lambda row: row,  # as it was: only the other scenario is driven
         lambda row: row.pop("comfort"),

@@ -247,9 +247,11 @@ def test_timestamps_that_are_no_list_are_named(make_message):
         scenario.check_consistency()
 
 
-@pytest.mark.parametrize("value", [None, np.array(3, np.int32), np.zeros(2, np.int32)])
-def test_arrays_of_the_scenario_itself_have_the_declared_axes(make_message, value):
+@pytest.mark.parametrize("name", ["tracks_to_predict", "difficulty", "objects_of_interest"])
+@pytest.mark.parametrize("is_scalar", [False, True])
+def test_lists_of_the_scenario_itself_are_lists(make_message, name, is_scalar):
     scenario = scenario_from_bytes(make_message("a").SerializeToString())
-    object.__setattr__(scenario, "tracks_to_predict", value)  # as a damaged shard has them
-    with pytest.raises(DataError, match=r"scenario\.(tracks_to_predict|difficulty) (is|has the shape)"):
+    value = getattr(scenario, name).sum(dtype=getattr(scenario, name).dtype) if is_scalar else None
+    object.__setattr__(scenario, name, value)  # as a damaged shard has them
+    with pytest.raises(DataError, match=rf"{name} is \S+, it must be a list of numbers"):
         check_scenario(scenario)

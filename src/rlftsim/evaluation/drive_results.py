@@ -35,7 +35,6 @@ CAUSES = {
     "comfort": "jerks",
 }  # fmt: skip
 """Part of the score `nuplan_style` -> what a planner does where it is low, the heaviest first."""
-FAILURES = (CAUSES["no_at_fault_collision"], CAUSES["drivable_area"])
 LOW = 0.5
 """A part of the score below this is named as a cause."""
 FAILED = "all scores"
@@ -242,6 +241,16 @@ class RankedScenario:
     """Type of traffic with this score."""
     causes: tuple[str, ...]
     """What the planner does there, of `CAUSES`."""
+
+
+def is_failure(scores: Mapping[str, float]) -> bool:
+    """True where a planner is at fault for a collision or leaves the road, by the scores of an episode, or by means."""
+    return scores["at_fault_collision_rate"] > 0 or scores["drivable_area"] < 1
+
+
+def find_failures(result: DriveResult) -> list[str]:
+    """Ids of the scenarios with a failure in any rollout, see `is_failure`."""
+    return [row["scenario_id"] for row in result.table.to_pylist() if is_failure(row)]
 
 
 def rank_scenarios(results: Sequence[DriveResult]) -> list[RankedScenario]:

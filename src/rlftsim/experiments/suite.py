@@ -37,8 +37,7 @@ from rlftsim.recipes.train import (
 )
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy
-from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
-from rlftsim.scenario.shards import hash_file
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.training.parallel import uses_cuda
 from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
 
@@ -329,6 +328,7 @@ class ExperimentSuite:
             # `may_change` knows names inside of a section: "finetune.device.threads" -> "device.threads".
             "recipe": {name: value for name, value in recipe.items() if not may_change(name.partition(".")[2])},
             "evaluation": {**self.evaluation.what_counts(), "limit": self.evaluation.limit},
-            "data": hash_file(self.data / MANIFEST),
+            "data": self.training.fingerprint,
+            "held_out": ScenarioDataset(self.data, self.evaluation.split).fingerprint,
             "base_model": fingerprint_policy(load_policy(self.base_model)) if self.base_model else None,
         }

@@ -133,6 +133,7 @@ def save_model(
     *,
     card: str = "",
     weights: Mapping[str, Tensor] | None = None,
+    extra: Mapping[str, Callable[[Path], object]] | None = None,
 ) -> None:
     """Write a model folder.
 
@@ -142,6 +143,7 @@ def save_model(
         config: Settings that the policy is built with when loaded, values that JSON has.
         card: Text of README.md; empty = a line that says that the origin is unknown.
         weights: Tensors by name; None = the policy's state dict, or no weights file for a policy that is no nn.Module.
+        extra: Functions that write further files, by name of the file; None = no more files.
 
     Raises:
         ConfigError: The policy declares no architecture.
@@ -156,6 +158,9 @@ def save_model(
         )
     if weights is None and isinstance(policy, nn.Module):
         weights = policy.state_dict()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, write in (extra or {}).items():
+        write(folder / name)
     if weights is not None:
         save_tensors(folder / WEIGHTS, weights)
     write_text(folder / CARD, card or f"A traffic model ({architecture}). Origin unknown.\n")

@@ -292,14 +292,14 @@ class Scenario:
             )
 
     def check_array_shapes(self) -> None:
-        """Check that tracks, map, lights and the scenario itself hold arrays with the axes that the classes declare.
+        """Check that tracks, map and lights hold arrays with the axes that the classes declare.
 
         Raises:
             DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
         features = self.map_features
-        tables = {"scenario": self, "tracks": self.tracks, "map": features, "topology": features.topology}
-        for name, table in (tables | {"lights": self.lights}).items():
+        tables = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
+        for name, table in tables.items():
             _check_shapes(table, name)
 
     def check_consistency(self) -> None:
@@ -314,6 +314,9 @@ class Scenario:
         tracks = self.tracks
         if self.num_steps < HISTORY_STEPS:
             raise DataError(f"{self.num_steps} steps, the history alone has {HISTORY_STEPS}")
+        for name in ("tracks_to_predict", "difficulty", "objects_of_interest"):
+            if np.ndim(getattr(self, name)) != 1:
+                raise DataError(f"{name} is {in_short(getattr(self, name))}, it must be a list of numbers")
         for name, indices in (("ego_index", [self.ego_index]), ("tracks_to_predict", self.tracks_to_predict)):
             for index in indices:
                 if not 0 <= index < len(tracks.object_id):

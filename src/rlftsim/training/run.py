@@ -301,8 +301,6 @@ class TrainingRun:
         # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
         is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
         self._check_divergence(report, has_checked_weights=is_due)
-        is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
-        self._check_divergence(report, has_checked_weights=is_due)
         if is_due and self.fabric.is_global_zero:
             numbers = learner.to_numbers() | ({STOPPED: 1.0} if report.stop_because else {})
             progress = Progress(learner.update, numbers)

@@ -53,6 +53,7 @@ def drive(
     """
     # Imported late: the environments need packages of an extra, and help does not.
     from rlftsim.envs import drive as driving
+    from rlftsim.envs.drive_scenario import choose_films, write_film
 
     # As `python -m` does, so that a planner in a file of this folder is found.
     sys.path.insert(0, "")
@@ -75,7 +76,7 @@ def drive(
             print_line(message)
         if failures:
             print(f"{result.name}: failed in {len(failures)} of {count} scenarios, which the means leave out.")
-    for scenario_id in driving.choose_films(results, film) if film is not None else ():
-        print(driving.film(config, scenario_id, out))
+    for scenario_id in choose_films(results, film) if film is not None else ():
+        print(write_film(config, scenario_id, out))
     print_line(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")
     return int(any(result.failures for result in results))

@@ -57,7 +57,7 @@ class RunSummary:
         The best of many training batches would be luck."""
         values = [line for line in self.metrics if self.measure == VALIDATION and VALIDATION in line]
         best = max(values, key=lambda line: line.get(BOUND, line[VALIDATION]), default=None)
-        return best and (int(best["update"]), float(best[VALIDATION]))
+        return None if best is None else (int(best["update"]), float(best[VALIDATION]))
 
     def _read_measure(self) -> list[tuple[int, float]]:
         name = self.measure

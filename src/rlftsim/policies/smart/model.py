@@ -8,7 +8,6 @@ import math
 import os
 from collections.abc import Collection
 from dataclasses import asdict
-from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -16,7 +15,6 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.checkpoint import are_frozen_alike, load_network, load_strictly, read_model, save_model
 from rlftsim.policies.distributions import (
     NEVER,
@@ -178,12 +176,10 @@ class SmartModel(nn.Module):
             folder: Folder of the model, created where it is missing.
             card: Text of README.md, in Markdown; empty = a line that names no origin.
         """
-        check_folder(Path(folder), "model")
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        self.vocabulary.to("cpu").save(Path(folder) / VOCABULARY)
         card = card or "A SMART traffic model. Origin unknown.\n"
         config = asdict(self.config) | ({} if self.sampling.is_full else {"sampling": asdict(self.sampling)})
-        save_model(folder, self, config, card=card, weights=self.network.state_dict())
+        extra = {VOCABULARY: self.vocabulary.to("cpu").save}
+        save_model(folder, self, config, card=card, weights=self.network.state_dict(), extra=extra)
 
     @classmethod
     def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
