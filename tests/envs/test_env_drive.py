@@ -466,6 +466,8 @@ def test_a_planner_that_fails_in_a_scenario_drives_the_others(tmp_path, monkeypa
     (whole,) = drive(DriveConfig("weak:Weak", traffic=("replay",), limit=3))
     assert whole.failures == {}
     np.testing.assert_equal(result.values("progress")[[0, 2]], whole.values("progress")[[0, 2]])
+    title = str(format_drive_comparison(compare_drives(whole, result)).title)
+    assert title.endswith("2 scenarios in both, without 1 in which a planner failed")
 
 
 def test_options_of_a_planner_are_written_behind_its_name(tmp_path, monkeypatch):

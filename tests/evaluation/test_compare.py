@@ -128,7 +128,7 @@ def test_a_comparison_is_shown_with_its_verdict():
     text = render(format_comparison(compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))))
     assert "tuned against base: 2 scenarios in both" in text
     assert "0.5000  0.6050  +0.1050" in text
-    assert "+0.041  +0.169  0.03  better" in text
+    assert "+0.0415  +0.1685  0.03  better" in text
 
 
 def test_a_comparison_needs_80_characters_and_nothing_is_cut(monkeypatch, capsys):

@@ -77,7 +77,7 @@ class PairedDifference:
     def cells(self) -> tuple[str, ...]:
         """Both means, the difference, both ends of the interval, the p-value and the verdict in a word, for tables."""
         means = [f"{mean:.4f}" if self.count else "–" for mean in (self.mean_a, self.mean_b)]
-        interval = ["–" if math.isnan(end) else f"{end:+.3f}" for end in self.interval]
+        interval = ["–" if math.isnan(end) else f"{end:+.4f}" for end in self.interval]
         difference = f"{self.difference:+.4f}" if self.count else "–"
         p_value = "–" if math.isnan(self.p_value) or not self.standard_error else f"{self.p_value:.2g}"
         return *means, difference, *interval, p_value, self._judge()

@@ -158,7 +158,7 @@ def _check_columns(table: pa.Table) -> None:
         TypeError: A column of values of a wrong type.
         ValueError: A scenario that is listed twice, or an impossible number.
     """
-    for name in (*TEXTS, *MAIN_SCORES):
+    for name in (*TEXTS, *MAIN_SCORES, *CAUSES):
         if name not in table.schema.names:
             raise KeyError(f"column {name}")
     for name, column in zip(table.schema.names, table.columns):
@@ -302,12 +302,14 @@ def format_drive_comparison(comparison: DriveComparison) -> Table:
     a, b = comparison.a, comparison.b
     models = {a.settings.model, b.settings.model} - {"none"}
     note = ", whose traffic models differ" if len(models) > 1 else ""
+    failed = len({*a.failures, *b.failures})
+    left_out = f", without {failed} in which a planner failed" if failed else ""
     parts_a, parts_b = (a.settings.planner, a.settings.traffic), (b.settings.planner, b.settings.traffic)
     # headings say what differs
     differing = [names for names in zip(parts_a, parts_b) if names[0] != names[1]]
     headings = differing[0] if len(differing) == 1 else (a.name, b.name)
     table = comparison_table(*headings, max((row.alpha for row in comparison), default=0.05))
-    table.title = f"{b.name} against {a.name}{note}: {max(row.count for row in comparison)} scenarios in both"
+    table.title = f"{b.name} against {a.name}{note}: {max(row.count for row in comparison)} scenarios in both{left_out}"
     for row in comparison:
         if row.column in MAIN_SCORES and row.count:
             table.add_row(row.column, *row.cells)
