@@ -581,10 +581,34 @@ def test_shares_of_different_settings_do_not_meet_in_a_folder(tmp_path, capsys):
     assert "was begun by a share for rollouts of constant_velocity with another seed" in capsys.readouterr().err
 
 
-def test_a_link_to_itself_is_no_output_folder(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "cause"),
+    [
+        ("loop", "loop is a link that leads nowhere, not a folder: choose another folder."),
+        ("link", "link is a link that leads nowhere, not a folder: choose another folder."),
+        ("loop/inner", "loop/inner: its links lead nowhere: choose another folder."),
+        ("pipe", "pipe is a pipe or device, not a folder: choose another folder."),
+        ("", "'' is no word, as of a variable that is not set: write a value."),
+        ("n" * 300, ": choose a shorter name."),
+    ],
+)
+def test_what_can_be_no_folder_is_no_output(name, cause, tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")
-    assert main(["simulate", "constant_velocity", "--data", "synthetic", "--out", str(tmp_path / "loop")]) == 2
-    assert "links lead nowhere: choose another folder" in capsys.readouterr().err
+    (tmp_path / "link").symlink_to("nothing")
+    os.mkfifo(tmp_path / "pipe")
+    out = name and str(tmp_path / name)
+    assert main(["simulate", "constant_velocity", "--data", "synthetic", "--out", out]) in (1, 2)
+    assert capsys.readouterr().err.endswith(f"{cause}\n")
+
+
+@pytest.mark.parametrize(("name", "cause"), [("loop", "a link that leads nowhere"), ("pipe", "a pipe or device")])
+@pytest.mark.parametrize("line", ["convert SOURCE OUT", "score SOURCE --scenarios synthetic"])
+def test_a_source_that_is_no_file_is_called_what_it_is(line, name, cause, tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    os.mkfifo(tmp_path / "pipe")
+    words = line.replace("SOURCE", str(tmp_path / name)).replace("OUT", str(tmp_path / "out"))
+    assert main(words.split()) == 2
+    assert f"{name}: {cause}" in capsys.readouterr().err
 
 
 def test_settings_without_effect_are_refused(tmp_path, capsys):

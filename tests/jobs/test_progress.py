@@ -1,10 +1,13 @@
 """Tables in the terminal."""
 
+import ast
 import sys
+from pathlib import Path
 
 from rich.table import Table
 
-from rlftsim.jobs.progress import log, print_line, print_wide
+import rlftsim
+from rlftsim.jobs.progress import log, print_line, print_lines, print_wide
 
 
 def test_no_control_character_of_a_name_reaches_the_terminal(capsys):
@@ -25,6 +28,23 @@ def test_lines_and_messages_show_no_control_character(capsys):
     printed = capsys.readouterr()
     assert printed.out == "skipped a 31m b  : no lane\n"
     assert printed.err == "skipped a 31m b  : no lane\na 31m b \n is left out\nin two lines\n"
+
+
+def test_no_line_of_a_verb_reaches_the_terminal_as_it_is():
+    """Names of users' files hold any sign; the command line, and a studio's own address, print no such name."""
+    package = Path(rlftsim.__file__).parent
+    printing = {
+        path.relative_to(package).as_posix()
+        for path in package.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    }
+    assert printing == {"jobs/progress.py", "cli/main.py", "cli/parse.py", "studio/serving.py"}
+
+
+def test_lines_of_a_card_stay_lines_without_control_characters(capsys):
+    print_lines("# a\x1b[2J\n\n* b\x07" + "c" * 1000)
+    assert capsys.readouterr().out == "# a [2J\n\n* b " + "c" * 1000 + "\n"
 
 
 def test_a_long_name_is_printed_without_its_middle(capsys):

@@ -108,6 +108,11 @@ def changed(rows, number, **values):
     return [{**row, **values} if k == number else row for k, row in enumerate(rows)]
 
 
+def backing(rows):
+    """Rows whose heading is turned for 1.5 s."""
+    return [{**row, "heading": 3.1} if 20 <= row["step"] < 35 else row for row in rows]
+
+
 TWO = [*car(7, 0.0), *car(8, 20.0)]
 ROW = {"scenario_id": "one", "ego_id": 7}
 NONE = pa.table({"scenario_id": pa.array([], pa.string()), "ego_id": pa.array([], pa.int64())})
@@ -118,8 +123,14 @@ BAD = {
     "NaN": ({"tracks": changed(TWO, 40, x=float("nan"))}, "tracks.parquet: row 40: x is nan"),
     "empty": ({"tracks": changed(TWO, 40, object_id=None)}, "tracks.parquet: row 40: object_id is empty"),
     "twice": ({"tracks": [*TWO, TWO[3]]}, r"tracks.parquet: row 182: object 7 has a second row for step 3"),
-    "jump": ({"tracks": changed(TWO, 95, x=40.0)}, "tracks.parquet: row 95: object 8 jumps 17.0 m in 0.10 s"),
-    "backwards": ({"tracks": [*car(7, 0.0), *car(8, 20.0, heading=3.1)]}, r"row \d+: object 8 moves against"),
+    "jumps": (
+        {"tracks": changed(changed(TWO, 4, x=-16.0), 95, x=44.0)},
+        r"tracks.parquet: positions jump in 2 of 2 tracks: track 7 moves 19.0 m from step 3 to 4: vx and",
+    ),
+    "backwards": (
+        {"tracks": [*backing(car(7, 0.0)), *backing(car(8, 20.0))]},
+        "tracks.parquet: headings contradict the motion of 2 of 2 .* track 7 backs up for more than 1 s",
+    ),
     "type": ({"tracks": changed(TWO, 3, type="tram")}, "row 3: type 'tram' is none of unset, vehicle"),
     "second type": ({"tracks": changed(TWO, 3, type="cyclist")}, "object 7 has a second type"),
     "size": ({"tracks": [{**row, "width": 0.0} for row in TWO]}, "row 0: width is 0, it must be above zero"),
@@ -166,6 +177,23 @@ def test_a_break_of_the_contract_is_named_with_its_row(tmp_path, kind):
     with pytest.raises(DataError) as caught:
         convert(tmp_path / "d", tmp_path / "data", on_error="stop", jobs=1, show_progress=False)
     assert re.search(cause, str(caught.value)), str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "detail"),
+    [
+        (changed(TWO, 95, x=40.0), "teleport: one: track 8 moves 17.0 m from step 3 to 4 (and 1 more)"),
+        (
+            [*car(7, 0.0), *backing(car(8, 20.0))],
+            "backward driving: one: track 8 moves against its heading faster than 3 m/s for more than 1 s from step 19",
+        ),
+    ],
+    ids=["jump", "backwards"],
+)
+def test_a_single_track_that_contradicts_itself_is_listed_and_costs_no_scenario(tmp_path, tracks, detail):
+    report = convert(write_tables(tmp_path / "d", tracks), tmp_path / "data", jobs=1, show_progress=False)
+    assert (report.converted, report.skipped) == (1, ())
+    assert [str(finding) for finding in verify_dataset(tmp_path / "data")] == [detail]
 
 
 def test_a_file_in_place_of_its_folder_is_refused(tmp_path):

@@ -89,6 +89,8 @@ def parse(words: Sequence[str]) -> Any:
         hint = f"did you mean {matches[0]}?" if matches else f"known are {', '.join(VERBS)}."
         raise ConfigError(f"no verb {in_short(words[0])}: {hint}")
     for word in words:
+        if not word.strip():
+            raise ConfigError(f"{in_short(word)} is no word, as of a variable that is not set: write a value.")
         try:
             word.encode()
         except UnicodeEncodeError:  # bytes that are no text, as Python keeps them; tables and messages take none
@@ -119,5 +121,6 @@ def _in_words(error: Exception) -> str | None:
             "the GPU has too little memory: lower the number of scenarios or rollouts in memory at once (see --help)."
         )
     if isinstance(error, OSError):
-        return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
+        way_out = ": choose a shorter name." if error.errno == errno.ENAMETOOLONG else ""
+        return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}{way_out}"
     return None

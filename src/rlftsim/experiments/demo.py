@@ -14,7 +14,7 @@ from rlftsim.evaluation.report import report_table, write_report
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.demo_report import BASE, CEILING, FLOOR, TUNED, DemoConfig, animate, build_report
 from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.train import find_vocabulary, finetune_model, open_training, pretrain_policy
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -76,5 +76,5 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         write_report(out / "report.html", report)
         to_png(out / "picture.png", animations[0])
     print_wide(report_table(report))
-    print(f"fine-tuned against base, {comparison.pairing}: {comparison['meta_metric'].verdict}")
+    print_line(f"fine-tuned against base, {comparison.pairing}: {comparison['meta_metric'].verdict}")
     return DemoResult(out / "report.html", comparison, evaluations)

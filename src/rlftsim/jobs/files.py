@@ -106,8 +106,16 @@ def check_result_file(path: Path) -> None:
         DataError: A folder, a pipe or a device.
     """
     if path.exists() and not path.is_file():
-        meaning = "a folder" if path.is_dir() else "a pipe or device"
-        raise DataError(f"{path} is {meaning}, not a file: choose another --out or name, or remove it.")
+        raise DataError(f"{path} is {describe_type(path)}, not a file: choose another --out or name, or remove it.")
+
+
+def describe_type(path: Path) -> str:
+    """What a path leads to, in words."""
+    if path.is_dir():
+        return "a folder"
+    if path.exists():
+        return "a file" if path.is_file() else "a pipe or device"
+    return "a link that leads nowhere" if path.is_symlink() else "no such file or folder"
 
 
 def temporary_path(path: Path) -> Path:

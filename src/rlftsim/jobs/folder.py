@@ -21,7 +21,7 @@ from typing import Any, Literal, TextIO
 
 from rlftsim.errors import ConfigError, DataError, NotYetError, in_short
 from rlftsim.jobs.documents import MAX_NAME_BYTES, read_json
-from rlftsim.jobs.files import check_result_file, errors_name, write_text
+from rlftsim.jobs.files import check_result_file, describe_type, errors_name, write_text
 from rlftsim.jobs.runner import Runner, Share, Unfinished, check_begun
 
 FolderType = Literal["data set", "submission", "set of rollouts", "model", "run", "results"]
@@ -69,8 +69,8 @@ def check_folder(folder: Path, folder_type: FolderType) -> None:
     Raises:
         DataError: A file, the folder of another type of result, or a folder inside a result folder.
     """
-    if folder.exists() and not folder.is_dir():
-        raise DataError(f"{folder} is a file, not a folder: choose another folder.")
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise DataError(f"{folder} is {describe_type(folder)}, not a folder: choose another folder.")
     if holder := _find_holder(folder):
         raise DataError(f"{folder} lies inside {holder}: choose another folder.")
     stored_type = recognize_folder(folder)

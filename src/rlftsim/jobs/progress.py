@@ -72,6 +72,15 @@ def print_line(text: object, file: Any = None) -> None:
     print(shorten(str(text)), file=file)
 
 
+def print_lines(text: str) -> None:
+    """Print a text without control characters, such as a model's card; lines stay lines, and long ones stay whole.
+
+    Args:
+        text: Lines.
+    """
+    print(_printable_lines(text))
+
+
 def print_wide(*tables: object) -> None:
     """Print tables as wide as the terminal or as COLUMNS says, else `FILE_WIDTH` wide in files. Brackets in texts are
     not markup."""

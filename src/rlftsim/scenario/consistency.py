@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
+from rlftsim.scenario.polylines import find_runs
 from rlftsim.scenario.types import STEP_S, MapFeatures, ObjectType, Tracks
 
 MIN_STEPS = 10
@@ -27,7 +28,9 @@ MAX_ASKEW_DEG = 20.0
 synthetic ones none; the median track of each of their scenarios is at most 8.1 degrees off. Of 515 paths that
 `demo-base` simulates the worst is 6.3 off."""
 MIN_COSINE = math.cos(math.radians(MAX_ASKEW_DEG))
-MAX_CLIMB_M = 2.0
+BACKING_S = 1.0
+"""Longest time for which a vehicle or cyclist faster than 3 m/s backs up; 2 of 4 913 real ones do so for longer."""
+MAX_JUMP_M, MAX_CLIMB_M = 5.0, 2.0
 """In 0.1 s; no track of 573 real and synthetic scenarios climbs or falls by more than 0.8."""
 MAX_SAMPLES = 100
 """Points between two of a feature; a longer gap is a mistake."""
@@ -80,6 +83,12 @@ def describe_contradictions(
             f"{DRIVING_MPS:g} m/s: track {tracks.object_id[contrary[0]]} faces more than {MAX_ASKEW_DEG:g} degrees "
             "away from it"
         )
+    elif 2 * len(backing := find_backing(tracks)) > num_judged > 1:
+        texts.append(
+            f"headings contradict the motion of {len(backing)} of {num_judged} vehicles and cyclists faster than "
+            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[backing[0][0]]} backs up for more than {BACKING_S:g} s"
+        )
+    texts += _describe_jumps("positions", "moves", np.where(is_observed, moved_mps * STEP_S, 0.0), MAX_JUMP_M, tracks)
     if "z" in guessed:
         return "; ".join(texts)
     contrary, num_judged = find_contrary(is_driving, climb_mps > moved_mps)
@@ -90,27 +99,51 @@ def describe_contradictions(
             f"{DRIVING_MPS:g} m/s: track {tracks.object_id[track]} climbs or falls at "
             f"{float(np.median(climb_mps[track, is_driving[track]])):.1f} m/s, more than 45 degrees"
         )
-    texts += _describe_heights(tracks, map_features, is_observed, is_moving)
+    climb_m = np.where(is_observed, climb_mps * STEP_S, 0.0)
+    texts += _describe_jumps("heights (z)", "climbs or falls by", climb_m, MAX_CLIMB_M, tracks)
+    texts += _describe_heights(tracks, map_features, is_moving)
     return "; ".join(texts)
 
 
-def _describe_heights(
-    tracks: Tracks,
-    map_features: MapFeatures | None,
-    is_observed: Bool[np.ndarray, "O s"],
-    is_moving: Bool[np.ndarray, "O s"],
+def find_backing(tracks: Tracks) -> list[tuple[int, int]]:
+    """Vehicles and cyclists that drive against their heading for longer than `BACKING_S`, with the first step of it."""
+    with np.errstate(invalid="ignore", over="ignore"):  # states that are not valid may hold infinities
+        dx, dy = np.moveaxis(np.diff(tracks.position[..., :2], axis=1) / np.float32(STEP_S), -1, 0)  # each [O, S-1]
+        heading = tracks.heading[:, 1:]
+        is_backing = (dx * np.cos(heading) + dy * np.sin(heading) < 0) & (np.hypot(dx, dy) > DRIVING_MPS)
+    is_backing &= tracks.valid[:, 1:] & tracks.valid[:, :-1] & np.isin(tracks.object_type, TYPES_WITH_FRONT)[:, None]
+    longest = round(BACKING_S / STEP_S)
+    runs = {track: find_runs(is_backing[track]) for track in np.flatnonzero(is_backing.sum(1) > longest).tolist()}
+    starts = {track: [start for start, stop in run.tolist() if stop - start > longest] for track, run in runs.items()}
+    return [(track, steps[0]) for track, steps in starts.items() if steps]
+
+
+def _describe_jumps(
+    name: str, motion: str, change_m: Float[np.ndarray, "O s"], limit_m: float, tracks: Tracks
 ) -> Iterator[str]:
-    """Heights that jump in most tracks, and those of most moving tracks that are not the map's."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        climb_m = np.abs(np.diff(tracks.position[..., 2])) * is_observed
-    jumps = np.argwhere(climb_m > MAX_CLIMB_M)
-    num_jumping = len(set(jumps[:, 0]))
-    if 2 * num_jumping > is_observed.any(1).sum():  # a single one is a finding of `find_problems`
+    """Values that jump in most tracks; those of fewer are findings of `inspect.find_problems`.
+
+    Args:
+        name: Name of the values.
+        motion: Verb of a track that jumps.
+        change_m: Change from each step to the next; 0 where it was not observed.
+        limit_m: Largest change that is no jump.
+        tracks: All tracks of a scenario.
+    """
+    jumps = np.argwhere(change_m > limit_m)
+    num_jumping, num_judged = len(set(jumps[:, 0])), int((tracks.valid[:, 1:] & tracks.valid[:, :-1]).any(1).sum())
+    if 2 * num_jumping > num_judged > 1:
         track, step = jumps[0]
         yield (
-            f"heights (z) jump in {num_jumping} of {len(climb_m)} tracks: track {tracks.object_id[track]} "
-            f"climbs or falls by {climb_m[track, step]:.1f} m from step {step} to {step + 1}"
+            f"{name} jump in {num_jumping} of {num_judged} tracks: track {tracks.object_id[track]} {motion} "
+            f"{change_m[track, step]:.1f} m from step {step} to {step + 1}"
         )
+
+
+def _describe_heights(
+    tracks: Tracks, map_features: MapFeatures | None, is_moving: Bool[np.ndarray, "O s"]
+) -> Iterator[str]:
+    """Heights of most moving tracks that are not the map's."""
     points = np.zeros((0, 3)) if map_features is None else _sample_points(map_features)
     position = tracks.position[:, 1:]
     is_judged = is_moving & np.isfinite(position).all(-1)

@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.consistency import MAX_CLIMB_M, describe_contradictions
+from rlftsim.scenario.consistency import (
+    BACKING_S,
+    DRIVING_MPS,
+    MAX_CLIMB_M,
+    MAX_JUMP_M,
+    describe_contradictions,
+    find_backing,
+)
 from rlftsim.scenario.dataset import (
     INDEX,
     Manifest,
@@ -21,9 +28,8 @@ from rlftsim.scenario.dataset import (
     read_manifest,
 )
 from rlftsim.scenario.shards import AGENT_COLUMNS, ShardReader, hash_file
-from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, STEP_S, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, ObjectType, Scenario
 
-TELEPORT_SPEED_MPS = 60.0
 FAR_MAP_M = 200.0
 """A map whose nearest point is farther from the ego is taken to be in another frame."""
 
@@ -37,6 +43,7 @@ class Problem(StrEnum):
     CONTRADICTORY_LIGHTS = "contradictory lights"
     CONTRADICTORY_MOTION = "contradictory motion"
     TELEPORT = "teleport"
+    BACKWARDS = "backward driving"
     MISSING_MAP = "missing map"
     MAP_ELSEWHERE = "map elsewhere"
     FAR_FROM_ORIGIN = "far from the origin"
@@ -203,17 +210,21 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
     with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
         moved = np.diff(tracks.position.astype(np.float64), axis=1)  # [O, S-1, 3]
     both_valid = tracks.valid[:, 1:] & tracks.valid[:, :-1]
-    speed = np.where(both_valid, np.hypot(moved[..., 0], moved[..., 1]), 0.0) / STEP_S  # [O, S-1]
+    shift = np.where(both_valid, np.hypot(moved[..., 0], moved[..., 1]), 0.0)  # [O, S-1]
     climb = np.where(both_valid & ("z" not in scenario.guessed), np.abs(moved[..., 2]), 0.0)
-    entries = np.argwhere((speed > TELEPORT_SPEED_MPS) | (climb > MAX_CLIMB_M))
+    entries = np.argwhere((shift > MAX_JUMP_M) | (climb > MAX_CLIMB_M))
     if len(entries):
         track, step = entries[0]
-        is_fast = speed[track, step] > TELEPORT_SPEED_MPS
-        motion = (
-            f"moves {speed[track, step] * STEP_S:.1f}" if is_fast else f"climbs or falls by {climb[track, step]:.1f}"
-        )
+        is_far = shift[track, step] > MAX_JUMP_M
+        motion = f"moves {shift[track, step]:.1f}" if is_far else f"climbs or falls by {climb[track, step]:.1f}"
         detail = f"track {tracks.object_id[track]} {motion} m from step {step} to "
         yield Finding(Problem.TELEPORT, scenario_id, f"{detail}{step + 1}{_format_repeats(len(entries))}")
+    backing = find_backing(tracks)
+    if backing:
+        track, step = backing[0]
+        motion = f"moves against its heading faster than {DRIVING_MPS:g} m/s for more than {BACKING_S:g} s"
+        detail = f"track {tracks.object_id[track]} {motion} from step {step}{_format_repeats(len(backing))}"
+        yield Finding(Problem.BACKWARDS, scenario_id, detail)
 
     features = scenario.map_features
     required = (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))

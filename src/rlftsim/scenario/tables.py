@@ -23,7 +23,7 @@ from rlftsim.errors import DataError, in_short
 from rlftsim.geometry import wrapped
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.consistency import describe_contradictions
-from rlftsim.scenario.polylines import Heights, densify, find_runs
+from rlftsim.scenario.polylines import Heights, densify
 from rlftsim.scenario.rows import Rows, Schema, read_rows
 from rlftsim.scenario.source import BytesRead, Item, Unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -50,10 +50,6 @@ from rlftsim.scenario.types import (
 TRACKS, MAP, SCENARIOS, LANES, LIGHTS = (f"{n}.parquet" for n in ("tracks", "map", "scenarios", "lanes", "lights"))
 LONGEST_HOLE_S = 0.5
 """States are interpolated between two rows of an object that are no farther apart."""
-LARGEST_JUMP_M = 5.0
-"""Largest move in 0.1 s."""
-MOVING_MPS, REVERSED_S = 3.0, 1.0
-"""Speed and duration beyond which a vehicle that drives backwards has a wrong heading."""
 NEAR_LANE_M = 10.0
 WRONG_SIDE = 0.75
 """Road edges that have nearby lanes on their right along more than this fraction run the wrong way."""
@@ -226,10 +222,6 @@ def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures
     has_second_type = is_same_object & (np.diff(object_type, prepend=object_type[:1]) != 0)
     rows.check(has_second_type, "object {} has a second type", ids)
     seconds = (step - first_step) * step_s  # [n]
-    gap_s = np.diff(seconds, prepend=seconds[:1])
-    moved = np.linalg.norm([np.diff(rows[name], prepend=rows[name][:1]) for name in ("x", "y")], axis=0)
-    is_jump = is_same_object & (gap_s <= LONGEST_HOLE_S + _EPSILON_S) & (moved > LARGEST_JUMP_M * gap_s / STEP_S)
-    rows.check(is_jump, "object {} jumps {:.1f} m in {:.2f} s", ids, moved, gap_s)
 
     # 2. States on the grid, object by object.
     num_steps = _count_steps(rows.table, seconds.max(initial=0.0), first_step)
@@ -251,10 +243,6 @@ def _read_tracks(rows: Rows, first_step: int, step_s: float, ground: MapFeatures
         for column, name in enumerate(SIZE_COLUMNS):
             if name in rows:
                 size[track, :, column] = rows[name][span][row_index]
-        reversed_step = _find_reversed(states[track], valid[track]) if types[track] != ObjectType.PEDESTRIAN else None
-        if reversed_step is not None:
-            motion = f"moves against its heading faster than {MOVING_MPS:g} m/s for more than {REVERSED_S:g} s"
-            raise rows.error(start + row_index[reversed_step], f"object {ids[start]} {motion}")
     if "z" in rows:
         z = states[..., 5]
     else:
@@ -294,16 +282,6 @@ def _sample_rows(
     at_row = np.abs(seconds[row] - grid) <= _EPSILON_S
     between = (seconds[row] < grid) & (grid < seconds[next_row])
     return at_row | (between & (seconds[next_row] - seconds[row] <= LONGEST_HOLE_S + _EPSILON_S)), row
-
-
-def _find_reversed(states: Float[np.ndarray, "S 6"], valid: Bool[np.ndarray, "S"]) -> int | None:
-    """First step of a stretch over which an object moves against the heading; None for an object that never does."""
-    moved = np.diff(states[:, :2], axis=0) / STEP_S  # [S-1, 2] m/s
-    heading = states[:-1, 2]
-    forward = moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading)
-    is_reversed = valid[1:] & valid[:-1] & (np.hypot(*moved.T) > MOVING_MPS) & (forward < 0)
-    starts = (start for start, stop in find_runs(is_reversed).tolist() if stop - start > REVERSED_S / STEP_S)
-    return next(starts, None)
 
 
 def _choose_predicted(tracks: Tracks, ego: int) -> list[int]:

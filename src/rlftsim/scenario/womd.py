@@ -15,6 +15,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import describe_type
 from rlftsim.jobs.progress import log
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.source import BytesRead, Item, Unit, read_unit, units_of_files
@@ -68,7 +69,7 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
         return files
     files = sorted(Path(name) for name in glob.glob(str(source), recursive=True) if os.path.isfile(name))
     if not files:
-        raise DataError(f"{source}: no such file or folder, and no file matches it as a pattern")
+        raise DataError(f"{source}: {describe_type(path)}, and no file matches it as a pattern")
     return files
 
 

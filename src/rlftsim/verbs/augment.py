@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work, check_jobs, choose_runner
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import get_device
@@ -44,4 +45,4 @@ def augment(
     check_jobs(jobs, get_device(policy), "jobs")
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(scenarios))
     count = augment_goals(policy, scenarios, out, config, runner=runner)
-    print(f"{out}: goals for {count} scenarios.")
+    print_line(f"{out}: goals for {count} scenarios.")

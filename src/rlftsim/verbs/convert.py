@@ -65,4 +65,4 @@ def convert(
         print_line(f"  left out: {record.file}, record {record.record}: {record.cause}")
     num_hidden = len(report.skipped) + len(report.duplicates) - MAX_LISTED
     if num_hidden > 0:
-        print(f"  ... and {num_hidden} more")
+        print_line(f"  ... and {num_hidden} more")

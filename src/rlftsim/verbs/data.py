@@ -28,7 +28,7 @@ def verify(data: str) -> int:
         print_line(finding)
     # Doubtful contents are in the logs themselves; only damage is an error.
     damaged = [finding for finding in findings if finding.problem.is_damage]
-    print(f"{data}: {len(damaged)} damaged files, {len(findings) - len(damaged)} doubtful contents.")
+    print_line(f"{data}: {len(damaged)} damaged files, {len(findings) - len(damaged)} doubtful contents.")
     return int(bool(damaged))
 
 
@@ -53,7 +53,7 @@ def push(folder: Path, url: str) -> None:
         folder: Folder of the data set.
         url: Address of the copy, such as s3://bucket/womd.
     """
-    print(f"{url}: {push_dataset(folder, url).num_scenarios} scenarios.")
+    print_line(f"{url}: {push_dataset(folder, url).num_scenarios} scenarios.")
 
 
 def pull(url: str, folder: Path) -> None:
@@ -63,7 +63,7 @@ def pull(url: str, folder: Path) -> None:
         url: Address of the data set, such as s3://bucket/womd.
         folder: Folder of the copy.
     """
-    print(f"{folder}: {pull_dataset(url, folder).num_scenarios} scenarios.")
+    print_line(f"{folder}: {pull_dataset(url, folder).num_scenarios} scenarios.")
 
 
 def _check_local(data: str) -> None:

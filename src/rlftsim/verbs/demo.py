@@ -6,6 +6,7 @@ from typing import Literal
 
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.demo import DemoConfig, run_demo
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
 from rlftsim.scenario.synthetic import pack_path
@@ -34,4 +35,4 @@ def demo(out: Path | None = None, processes: int | Literal["auto"] = "auto", qui
         num_scenes=2 if quick else 3,
     )
     result = run_demo(config, out or Path("runs/demo-quick" if quick else "runs/demo"))
-    print(f"report: {result.report}")
+    print_line(f"report: {result.report}")

@@ -75,8 +75,8 @@ def drive(
         for message in list(failures.values())[:MAX_WORST]:
             print_line(message)
         if failures:
-            print(f"{result.name}: failed in {len(failures)} of {count} scenarios, which the means leave out.")
+            print_line(f"{result.name}: failed in {len(failures)} of {count} scenarios, which the means leave out.")
     for scenario_id in choose_films(results, film) if film is not None else ():
-        print(write_film(config, scenario_id, out))
+        print_line(write_film(config, scenario_id, out))
     print_line(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")
     return int(any(result.failures for result in results))

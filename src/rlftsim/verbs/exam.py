@@ -82,7 +82,7 @@ def exam(
     print_wide(*(table.for_terminal() for table in tables))
     for line in verdicts:
         print_line(f"* {line}")
-    print(result.folder / "exam.md")
+    print_line(result.folder / "exam.md")
 
 
 def parse_rows(words: list[str]) -> dict[str, list[str]]:

@@ -121,7 +121,7 @@ def experiment(
     print_wide(*(table.for_terminal() for table in result.tables))
     for line in result.verdicts:
         print_line(f"* {line}")
-    print(f"{out / name}.md")
+    print_line(f"{out / name}.md")
 
 
 experiment.__doc__ = (experiment.__doc__ or "").replace("name: QUESTIONS", f"name: {QUESTIONS}")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from rlftsim.errors import whole_number
-from rlftsim.jobs.progress import log, print_wide
+from rlftsim.jobs.progress import log, print_line, print_wide
 from rlftsim.jobs.runner import Work, choose_runner
 
 
@@ -72,11 +72,11 @@ def failures(
     study = run_study(config, out, steps, lambda count: work.runner(jobs, work.on_error) or choose_runner(jobs, count))
     print_wide(format_study(study))
     for problem in study.problems.values():
-        print(f"left out: {problem}")
-    print(study.describe_total())
+        print_line(f"left out: {problem}")
+    print_line(study.describe_total())
     page = out / "index.html"
     write_failure_page(study, page, limit=films)
-    print(page)
+    print_line(page)
 
 
 def show_failure(folder: Path, number: int, *, film: Path | None = None) -> None:
@@ -95,7 +95,7 @@ def show_failure(folder: Path, number: int, *, film: Path | None = None) -> None
     config, failure = read_failure(folder, number)
     exhibit = build_exhibit(config, number, failure)
     for name, text in exhibit.facts().items():
-        print(f"{name}: {text}")
+        print_line(f"{name}: {text}")
     if film is not None:
         Result(exhibit.record).film(film, title=config.planner)
-        print(film)
+        print_line(film)

@@ -97,7 +97,7 @@ def propose_goals(
                 f"{out} not written, none of these agents can do {choose}: {reason}; or name others with --agent."
             )
         write_goals(out, GoalsFile(tuple(goals), tuple(alternatives)))
-        print(f"{out}: {len(goals)} goals, {len(alternatives)} alternatives.")
+        print_line(f"{out}: {len(goals)} goals, {len(alternatives)} alternatives.")
 
 
 def _is_choice(proposal: Proposal, choice: Choice) -> bool:
@@ -142,7 +142,7 @@ def check_goals(file: Path, data: str) -> None:
     for line in lines:
         print_line(line)
     counts = f"{len(goals.goals)} goals in {len(goals.scenario_ids)} scenarios, {len(goals.alternatives)} alternatives"
-    print(f"{file}: {counts}, {len(lines)} doubts.")
+    print_line(f"{file}: {counts}, {len(lines)} doubts.")
 
 
 def read_given_goals(file: Path | None, written: list[str], scenario_ids: list[str] | None) -> GoalsFile:

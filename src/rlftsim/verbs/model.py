@@ -9,7 +9,7 @@ from torch import nn
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.folder import check_file
-from rlftsim.jobs.progress import print_line
+from rlftsim.jobs.progress import print_line, print_lines
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
@@ -38,7 +38,7 @@ def import_model(checkpoint: Path, vocabulary: list[Path], out: Path, *, format:
     imported = import_catk(checkpoint, vocabulary)
     imported.policy.save_pretrained(out, card=_card(checkpoint, imported))
     weights = sum(p.numel() for p in imported.policy.parameters())
-    print(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
+    print_line(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
     for note in imported.notes:
         print_line(f"  {note}")
 
@@ -64,9 +64,10 @@ def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
     check_file(out)
     write_catk(policy, out)
     write_catk_vocabulary(policy.vocabulary, tables)
-    print(f"{out}: weights\n{tables}: token tables")
+    print_line(f"{out}: weights")
+    print_line(f"{tables}: token tables")
     if not policy.config.catk_compat:
-        print("  trained here: the public code treats an agent's first motion differently (docs/catk.md)")
+        print_line("  trained here: the public code treats an agent's first motion differently (docs/catk.md)")
 
 
 def average_models(models: list[str], out: Path, *, base: str | None = None, scale: float = 1.0) -> None:
@@ -91,7 +92,7 @@ def average_models(models: list[str], out: Path, *, base: str | None = None, sca
     card = f"# Mean of {len(models)} models\n\n* {', '.join(models)}\n{scaled}"
     card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
     average.save_pretrained(out, card=append_cards(card, [*models, *filter(None, [base])]))
-    print(f"model: {out}")
+    print_line(f"model: {out}")
 
 
 def list_models() -> None:
@@ -103,7 +104,7 @@ def list_models() -> None:
     policies = {name: POLICIES.get(name) for name in POLICIES.names()}
     summaries = {name: summarize_docstring(make) for name, make in policies.items() if needs_no_arguments(make)}
     for name, summary in summaries.items():
-        print(f"{name:{max(map(len, summaries))}}  {summary}")
+        print_line(f"{name:{max(map(len, summaries))}}  {summary}")
 
 
 def show_model(model: str) -> None:
@@ -114,8 +115,8 @@ def show_model(model: str) -> None:
     """
     policy = load_policy(model)
     weights = sum(p.numel() for p in policy.parameters()) if isinstance(policy, nn.Module) else 0
-    print(f"{model}: {type(policy).__name__}, {weights:,} weights\n")
-    print(read_card(model, heading_shift=0) or "No card.")
+    print_line(f"{model}: {type(policy).__name__}, {weights:,} weights")
+    print_lines("\n" + (read_card(model, heading_shift=0) or "No card."))
 
 
 def _check_empty(folder: Path) -> None:

@@ -66,7 +66,7 @@ def plugins() -> int:
     """
     plug_ins = list_plug_ins()
     if not plug_ins:
-        print(f"no installed package has an entry point in {', '.join(POINTS)}.")
+        print_line(f"no installed package has an entry point in {', '.join(POINTS)}.")
         return 0
     headings = ("group", "name", "package", "version", "object", "state")
     table = Table(*(Column(heading, overflow="fold") for heading in headings))

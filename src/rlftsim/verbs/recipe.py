@@ -3,6 +3,7 @@
 import inspect
 from typing import Any
 
+from rlftsim.jobs.progress import print_line, print_lines
 from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import recipe_as_json, recipe_as_text
 from rlftsim.verbs.arguments import Name
@@ -44,6 +45,6 @@ def print_recipe(recipe: Any, *, json: bool = False) -> None:
     """
     if isinstance(recipe, dict):
         for name, summary in recipe.items():
-            print(f"{name:{max(map(len, recipe))}}  {summary}")
+            print_line(f"{name:{max(map(len, recipe))}}  {summary}")
     else:
-        print(recipe_as_json(recipe) if json else recipe_as_text(recipe))
+        print_lines(recipe_as_json(recipe) if json else recipe_as_text(recipe))

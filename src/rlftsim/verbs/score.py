@@ -11,7 +11,7 @@ from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.in_memory import score_in_memory
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
-from rlftsim.jobs.progress import print_line, print_wide
+from rlftsim.jobs.progress import print_line, print_lines, print_wide
 from rlftsim.jobs.runner import Unfinished, Work
 from rlftsim.realism import RealismResult
 from rlftsim.rollout.types import Rollouts
@@ -114,7 +114,7 @@ def _score_files(
     def write_pages() -> None:
         if explain is not None:
             pages = explain_rollouts(rollouts, folder, explain, config, runner=runner)
-            print(f"{explain}: {len(pages)} pages", file=sys.stderr)
+            print_line(f"{explain}: {len(pages)} pages", file=sys.stderr)
 
     # Before the pages: what scores refuse, such as a name or a share, is refused before a page is written.
     try:
@@ -134,7 +134,7 @@ def print_scores(result: Evaluation, *, json: bool = False) -> None:
         json: Print JSON with the field names of the official messages instead of a table.
     """
     if json:
-        print(json_text.dumps(to_json(result), allow_nan=False))
+        print_lines(json_text.dumps(to_json(result), allow_nan=False))
     else:
         print_wide(format_scores(result))
     # On standard error, so that --json prints nothing but JSON.

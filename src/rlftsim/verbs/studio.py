@@ -6,6 +6,7 @@ from pathlib import Path
 import tyro
 
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.progress import print_line
 from rlftsim.studio import check_extra
 from rlftsim.verbs.arguments import Device
 
@@ -59,7 +60,7 @@ def studio(
     from rlftsim.studio.session import Session
 
     if host not in LOOPBACK:
-        print(f"rlftsim: listening on {host}, unencrypted: keep the address secret.", file=sys.stderr)
+        print_line(f"rlftsim: listening on {host}, unencrypted: keep the address secret.", file=sys.stderr)
     session = Session(data, model or ("demo-goals",), split, out, device, rollouts)
     token = None if token_file is None else load_token(token_file)
     server = Studio(session, host=host, port=port, token=token, trusted_hosts=trust_host)

@@ -6,7 +6,7 @@ from pathlib import Path
 from rlftsim.errors import ConfigError, shorten
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
 from rlftsim.jobs.folder import check_file
-from rlftsim.jobs.progress import print_line, print_wide
+from rlftsim.jobs.progress import print_line, print_lines, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.open import open_dataset
@@ -98,7 +98,7 @@ def build(
         entry, policy, dataset, settings, out, num_shards=num_shards, round_m=round, is_partial=partial
     )  # fmt: skip
     closed_loop = statement(policy, settings.sampling)
-    print(closed_loop)
+    print_lines(closed_loop)
     if not i_comply:
         raise ConfigError("an entry has to declare this: add --i-comply if it is true of yours.")
     archive = build_archive(job, runner=work.runner(jobs, work.on_error), is_deleting=delete_parts)
@@ -116,10 +116,10 @@ def build(
     text, _ = report.write(archive)
     _print_findings(result)
     if result.findings.has_errors:
-        print(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
+        print_line(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
     else:
         delete_shards(job)
-    print(f"{archive}: {result.size} bytes, SHA-256 {result.sha256}\n{text}")
+    print_lines(f"{archive}: {result.size} bytes, SHA-256 {result.sha256}\n{text}")
     return int(result.findings.has_errors)
 
 
@@ -176,7 +176,7 @@ def info(archive: Path, *, split_gb: float | None = None) -> int:
             print_line(f"  {entry.name}: {shorten(text)}")
     if split_gb is not None:
         files = split_file(archive, split_gb)
-        print(f"{len(files)} parts; join them with: cat {archive.name}.??? > {archive.name}")
+        print_line(f"{len(files)} parts; join them with: cat {archive.name}.??? > {archive.name}")
     return int(result.findings.has_errors)
 
 
@@ -185,7 +185,7 @@ def _print_findings(check: ArchiveCheck) -> None:
     for line in check.findings.lines():
         print_line(line)
     note = "" if check.num_checked == check.num_scenarios else f", trajectories of {check.num_checked} looked at"
-    print(
+    print_line(
         f"{check.archive}: {len(check.shards)} shards, {check.num_scenarios} scenarios{note}, "
         f"{check.raw_bytes / 1e9:.3g} GB of messages, {check.size} bytes, SHA-256 {check.sha256}: "
         f"{sum(check.findings.counts.values()) or 'no'} findings."

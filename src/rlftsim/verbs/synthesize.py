@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work
 from rlftsim.scenario.synthetic.generate import generate
 
@@ -29,4 +30,4 @@ def synthesize(
     manifest = generate(
         destination, num_scenarios=num_scenarios, seed=seed, jobs=jobs, runner=work.runner(jobs, work.on_error)
     )
-    print(f"{destination}: {sum(shard.num_rows for shard in manifest.shards)} scenarios.")
+    print_line(f"{destination}: {sum(shard.num_rows for shard in manifest.shards)} scenarios.")

@@ -8,7 +8,7 @@ from rich.table import Column, Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.folder import check_file
-from rlftsim.jobs.progress import log, print_wide
+from rlftsim.jobs.progress import log, print_line, print_wide
 from rlftsim.policies.smart.catk_checkpoint import read_catk_vocabulary
 from rlftsim.scenario.open import open_dataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
@@ -106,7 +106,7 @@ def tokens(
         if coverage.num_tokens == 1 and coverage.use.sum() > 1:
             log.info(f"{coverage.class_name}s have a single token, which stands still: their motion cannot be learned.")
     counts = ", ".join(f"{c.num_tokens} {c.class_name}" for c in classes)
-    print(f"{source}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
+    print_line(f"{source}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
 
 
 def _check_is_vocabulary(path: Path) -> None:
