@@ -656,3 +656,12 @@ def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatc
         (again,) = drive(config, out)
         assert driven == ([0, 1] if number else [1])
         np.testing.assert_equal(again.table.to_pydict(), whole.table.to_pydict())
+
+
+def test_an_error_of_the_world_is_not_the_planners(monkeypatch):
+    def step(env, action):
+        raise RuntimeError("a defect of ours")
+
+    monkeypatch.setattr(EgoEnv, "step", step)
+    with pytest.raises(RuntimeError, match="a defect of ours"):
+        driven("idm", straight_road())

@@ -51,11 +51,28 @@ def test_the_budget_goes_where_failures_are_likely_and_every_scenario_has_a_roun
         share_budget(pilots, 16, 5000)
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"limit": 0}, "limit must be"),
+        ({"scenarios": ("a", "b", "a")}, "names one twice"),
+        ({"event": "rain"}, "known are at_fault_collision"),
+    ],
+)
+def test_settings_that_make_no_study_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        StudyConfig("idm", **settings)
+
+
 def test_the_total_is_a_stratified_mean():
     scenarios = (estimate(0.1, 0.2, 0.3), estimate(0.0, 0.0), estimate(0.01, 0.03))
     mean, low, high = Study(StudyConfig("idm"), scenarios, {}).mean_interval()
     assert mean == pytest.approx((0.2 + 0.0 + 0.02) / 3)
     assert 0 < low < mean < high <= 1
+    # a third of the scenarios had no event in 32 undisturbed episodes: 9 % of theirs may have one
+    eventful = Study(StudyConfig("idm"), scenarios[::2], {}).mean_interval()
+    assert low == pytest.approx(eventful[1] * 2 / 3)
+    assert high == pytest.approx(eventful[2] * 2 / 3 + (1 - 0.05 ** (1 / 32)) / 3)
     assert Study(StudyConfig("idm"), (estimate(0.0, 0.0), estimate(0.0)), {}).mean_interval()[2] == pytest.approx(
         1 - 0.05 ** (1 / 32)
     )

@@ -2,14 +2,17 @@
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rlftsim.envs import EgoEnv, estimate_failures
 from rlftsim.envs.dangers import EVENTS, StepView, find_event
-from rlftsim.envs.failures import FailureChain, choose_failures, make_source
-from rlftsim.envs.planners.registry import load_planner
+from rlftsim.envs.failure_run import _drive_pilot
+from rlftsim.envs.failure_study import StudyConfig
+from rlftsim.envs.failures import Failure, FailureChain, choose_failures, make_source
+from rlftsim.envs.planners.registry import PlannerFailure, load_planner
 from rlftsim.envs.record import build_record
 from rlftsim.envs.result import Result
 from rlftsim.errors import ConfigError, DataError
@@ -181,3 +184,57 @@ def test_an_event_has_happened_exactly_where_the_scores_say_so(model, event):
 def test_films_are_of_different_beginnings_first(model):
     found = estimate_failures("idm", straight_road(), event=Ever(), particles=4, repeats=2, policy=model, max_steps=10)
     assert len({f.dice[0] for f in choose_failures(found.failures, 8)}) == 8
+
+
+def test_hard_braking_is_seen_in_every_step_of_a_planners_action():
+    # the speeds of an action of five steps: the planner brakes with 7 m/s² in the second one alone
+    speeds = np.array([10.0, 10.0, 9.3, 9.3, 9.3, 9.3])
+    track = [np.zeros((1, 1, 5)) for _ in speeds]
+    for motion, speed in zip(track, speeds):
+        motion[0, 0, 3] = speed
+    world = SimpleNamespace(track=track, step=5)
+    episode = SimpleNamespace(world=SimpleNamespace(actors=np.zeros((1, 2), int)), controls=SimpleNamespace(steps=5))
+    view = StepView(episode, SimpleNamespace(world=world), 0)
+    assert view.acceleration == pytest.approx(-7.0)
+    assert EVENTS["hard_braking"].danger(view) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("method", ["reset", "seed", "act"])
+def test_a_planner_that_fails_is_named_with_its_scenario(model, method):
+    class Failing:
+        def reset(self, info):
+            self.fail("reset")
+
+        def seed(self, number):
+            self.fail("seed")
+
+        def act(self, observation):
+            self.fail("act")
+
+        def fail(self, name):
+            if name == method:
+                raise IndexError("no lane")
+            return np.zeros(2)
+
+    with pytest.raises(
+        PlannerFailure, match="planner Failing fails at step 0 of scenario straight: IndexError: no lane"
+    ):
+        estimate_failures(Failing(), straight_road(), policy=model, particles=2, repeats=1, max_steps=10)
+
+
+def test_a_pilot_explains_a_failing_planner_and_hands_on_what_is_not_its_fault(monkeypatch):
+    def run(chain, numbers):
+        raise error
+
+    monkeypatch.setattr(FailureChain, "start", run)
+    config = StudyConfig("idm", pilot=2)
+    error = PlannerFailure("planner Idm fails")
+    assert _drive_pilot(config, config.scenario_ids(), 0)["problem"] == "planner Idm fails"
+    error = DataError("a damaged shard")
+    with pytest.raises(DataError, match="a damaged shard"):
+        _drive_pilot(config, config.scenario_ids(), 0)
+
+
+def test_a_contact_is_of_a_type():
+    with pytest.raises(ConfigError, match=r"a contact is stopped_ego, .* or empty, got 'rear'"):
+        Failure("a", 0.1, (0,), 1, "", contact="rear")

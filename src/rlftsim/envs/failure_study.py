@@ -73,6 +73,10 @@ class StudyConfig:
         check_types(self)
         for name, least in (("particles", 2), ("pilot", 2), ("seed", 0)):
             whole_number(name, getattr(self, name), least)
+        if self.limit is not None:
+            whole_number("limit", self.limit, 1)
+        if len(set(self.scenarios or ())) < len(self.scenarios or ()):
+            raise ConfigError(f"scenarios names one twice: {', '.join(self.scenarios or ())}.")
         if self.event not in EVENTS:
             raise ConfigError(f"event {in_short(self.event)}: known are {', '.join(EVENTS)}.")
 
@@ -190,12 +194,18 @@ class Study:
         return sorted(failures, key=lambda failure: -failure.probability)
 
     def mean_interval(self) -> tuple[float, float, float]:
-        """Probability of the event in an episode of these scenarios, a stratified mean, and its 95 % interval."""
+        """Probability of the event in an episode of these scenarios, a stratified mean, and its 95 % interval.
+
+        The upper end has what scenarios without an event may hide, too: the exact bound by their undisturbed episodes,
+        which is largest where all of them hide the same.
+        """
         variances = np.array([s.variance for s in self.scenarios]) / len(self.scenarios) ** 2
         mean = float(np.mean([s.probability for s in self.scenarios]))
+        quiet, hidden = [s.particles * len(s.repeats) for s in self.scenarios if s.probability == 0], 0.0
+        if quiet:
+            hidden = len(quiet) / len(self.scenarios) * (1 - 0.05 ** (1 / (min(quiet) * len(quiet))))
         if mean == 0:
-            least = min(s.particles * len(s.repeats) for s in self.scenarios)
-            return 0.0, 0.0, 1 - 0.05 ** (1 / (least * len(self.scenarios)))
+            return 0.0, 0.0, hidden
         counts = np.array([len(s.repeats) for s in self.scenarios])
         variance = float(variances.sum())
         if not variance > 0:
@@ -204,7 +214,7 @@ class Study:
         degrees = variance**2 / float((variances[has_variance] ** 2 / (counts[has_variance] - 1)).sum())
         # of the logarithm, which keeps the lower end positive
         half = float(stats.t.ppf(0.975, degrees)) * math.sqrt(variance) / mean
-        return mean, mean * math.exp(-half), min(mean * math.exp(half), 1.0)
+        return mean, mean * math.exp(-half), min(mean * math.exp(half) + hidden, 1.0)
 
     @property
     def km_and_hours(self) -> tuple[float, float]:

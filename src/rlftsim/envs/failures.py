@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.contact import Collision
+from rlftsim.envs.contact import Collision, CollisionType
 from rlftsim.envs.dangers import Event, StepView, find_event
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.planners.registry import Planner, guard_planner, read_action_settings, to_planner
@@ -65,6 +65,8 @@ class Failure:
         object.__setattr__(self, "dice", tuple(self.dice))
         if self.step < 0 or not all(isinstance(number, int) and number >= 0 for number in self.dice):
             raise ConfigError(f"a failure has whole numbers of step and dice, got {in_short([self.step, self.dice])}.")
+        if self.contact not in ("", *CollisionType):
+            raise ConfigError(f"a contact is {', '.join(CollisionType)} or empty, got {in_short(self.contact)}.")
 
 
 @dataclass(frozen=True)
