@@ -579,7 +579,7 @@ FORMATS: Mapping[str, Format] = {
         {"run/checkpoints/*4/*.safetensors": "safetensors", "run/checkpoints/*4/*.json": "json"},
         make_run,
         read_run,
-        ("training.run_folder",),
+        ("training.checkpoint",),
     ),
     "settings": Format({"*.json": "json"}, make_config, read_config, ("recipes.settings",)),
     "ledger": Format(

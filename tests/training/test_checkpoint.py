@@ -9,7 +9,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from rlftsim.errors import CheckpointError, DataError
-from rlftsim.training.run_folder import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 
 
 def small_run(seed=0, steps=3):

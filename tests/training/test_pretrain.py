@@ -15,11 +15,12 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
+from rlftsim.training.checkpoint import newest_checkpoint
 from rlftsim.training.config import PretrainConfig
 from rlftsim.training.data import trained_agents
 from rlftsim.training.imitation import learning_rate, summed_loss
 from rlftsim.training.run import train_policy
-from rlftsim.training.run_folder import newest_checkpoint, read_metrics
+from rlftsim.training.run_folder import read_metrics
 
 
 def test_a_tiny_model_learns_what_it_sees(vocabulary, drawn_scenarios, tmp_path):

@@ -21,24 +21,14 @@ from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
 from rlftsim.training.data import share_cache
 from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
 from rlftsim.training.monitoring import Validator, check_validation
 from rlftsim.training.parallel import Fabric, all_reduce_sum, count_processes, forks_processes, num_sharing_memory
 from rlftsim.training.processes import linked_processes
 from rlftsim.training.registry import find_method
-from rlftsim.training.run_folder import (
-    Progress,
-    RunFolder,
-    describe_inputs,
-    flatten,
-    newest_checkpoint,
-    parse_update,
-    read_checkpoint,
-    read_metrics,
-    stored_settings,
-    write_checkpoint,
-)
+from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, read_metrics, stored_settings
 
 STOPPED = "stopped"
 """Number of a checkpoint that says that the run ended there by itself."""

@@ -19,23 +19,22 @@ import sys
 import time
 from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor, nn
-from torch.optim import Optimizer
+from torch import nn
 
 from rlftsim import __version__
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.documents import parse_json, read_json
-from rlftsim.jobs.files import append_text, errors_name, remove_folder, save_tensors, write_text
+from rlftsim.jobs.files import append_text, errors_name, save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios, list_scenario_ids
+from rlftsim.training.checkpoint import check_weights, list_checkpoints, newest_checkpoint, parse_update
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -231,7 +230,7 @@ class RunFolder:
         way_out = f"remove {self.path} and train again"
         try:
             weights, _ = read_tensors(path, way_out, error=CheckpointError)
-            _check_weights(path.stem, weights, model)
+            check_weights(path.stem, weights, model)
         except FileNotFoundError:
             raise CheckpointError(f"{path} is missing, the weights of the best validation: {way_out}.") from None
         except ValueError as error:
@@ -241,7 +240,7 @@ class RunFolder:
     def remove_superseded_best(self) -> None:
         """Remove the weights of validations that were the best once, but are so for no checkpoint of the folder."""
         paths = sorted((self.path / "best").glob("update-*.safetensors"))
-        checkpoints = [self._best(parse_update(path)) for path in _checkpoints(self.checkpoints)]
+        checkpoints = [self._best(parse_update(path)) for path in list_checkpoints(self.checkpoints)]
         needed = {max((path for path in paths if path <= checkpoint), default=None) for checkpoint in checkpoints}
         for path in paths:
             if path not in needed and path < max(checkpoints):
@@ -353,173 +352,3 @@ def _read_lines(metrics: Path) -> list[tuple[str, dict[str, Any]]]:
             if is_sound and math.isfinite(values.get("update", math.inf)):
                 lines.append((line, values))
     return lines
-
-
-# ---- checkpoints ---------------------------------------------------------------------------------------------------
-#
-# All that a run resumes from, in files without code: a folder `update-00000120` with safetensors and a JSON file. It is
-# written under a temporary name and renamed when whole, so a folder of that name is never half-written.
-
-PREFIX = "update-"
-NUM_CHECKPOINTS = 2
-"""Number of checkpoints that are kept; older ones are removed."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Position of a run."""
-
-    update: int = 0
-    """Updates done."""
-    numbers: dict[str, float] = field(default_factory=dict)
-    """Further state that changes from update to update, such as beta."""
-
-
-def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Module], optimizer: Optimizer) -> Path:
-    """Write a checkpoint of a run into `folder` and remove all but the newest.
-
-    Args:
-        folder: Folder of the run's checkpoints.
-        progress: Position of the run.
-        modules: Weights by file name, such as policy and reference.
-        optimizer: Optimizer with the moments to store, too.
-
-    Raises:
-        DataError: A file cannot be written, such as on a full disk; names it. Older checkpoints are untouched.
-    """
-    target = folder / f"{PREFIX}{progress.update:08d}"
-    partial = folder / f".partial-{target.name}"
-    files = (*(f"{name}.safetensors" for name in (*modules, "optimizer")), "progress.json")
-    with errors_name(target):
-        remove_folder(partial, files)  # left by a run that was killed
-        partial.mkdir(parents=True, exist_ok=True)
-        for name, module in modules.items():
-            save_tensors(partial / f"{name}.safetensors", module.state_dict())
-        # "0.exp_avg" = the first moment of the first parameter, in the order of the optimizer's groups.
-        states = optimizer.state_dict()["state"]
-        tensors = {f"{i}.{name}": value.detach().cpu() for i, state in states.items() for name, value in state.items()}
-        save_tensors(partial / "optimizer.safetensors", tensors)
-        write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
-        remove_folder(target, files)
-        partial.rename(target)
-        # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
-        for old in _checkpoints(folder)[:-NUM_CHECKPOINTS]:
-            remove_folder(old, files)
-    return target
-
-
-def newest_checkpoint(folder: Path) -> Path | None:
-    """The latest whole checkpoint of a run; None if there is none yet."""
-    return max(_checkpoints(folder), default=None)
-
-
-def _checkpoints(folder: Path) -> list[Path]:
-    """Whole checkpoints of a run, the latest last; other files of a similar name belong to a user."""
-    return sorted(path for path in folder.glob(f"{PREFIX}*") if path.name.removeprefix(PREFIX).isdecimal())
-
-
-def parse_update(path: Path) -> int:
-    """Updates that a run had done at a checkpoint."""
-    return int(path.name.removeprefix(PREFIX))
-
-
-def read_checkpoint(
-    path: Path, modules: dict[str, nn.Module], optimizer: Optimizer, names: Collection[str] = ()
-) -> Progress:
-    """Load weights and moments in place.
-
-    Args:
-        path: Folder of the checkpoint, named after the update.
-        modules: Modules by the names that `write_checkpoint` got; weights are loaded in place.
-        optimizer: Optimizer with the same parameters in the same order; the learning rate stays.
-        names: Names of the numbers that the progress must have.
-
-    Returns:
-        The position of the run.
-
-    Raises:
-        CheckpointError: damaged, or of a different model.
-    """
-    way_out = "cannot go on from it, delete this folder to go on from an older one"
-    try:
-        values = read_json(path / "progress.json", way_out, error=CheckpointError)
-        # everything is checked before anything is loaded
-        weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
-        moments = _read(path / "optimizer.safetensors", way_out)
-        _check_progress(values, parse_update(path), names)
-        for name, module in modules.items():
-            _check_weights(name, weights[name], module)
-        state = _parse_moments(moments, optimizer)
-    except FileNotFoundError as error:
-        raise CheckpointError(f"{path}: {Path(error.filename or '').name or 'a file'} is missing: {way_out}.") from None
-    except ValueError as error:
-        raise CheckpointError(f"{path}: {error}: {way_out}.") from None
-    for name, module in modules.items():
-        module.load_state_dict(weights[name])
-    # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    return Progress(values["update"], values["numbers"])
-
-
-def _read(path: Path, way_out: str) -> dict[str, Tensor]:
-    try:
-        return read_tensors(path, way_out, error=CheckpointError)[0]
-    except FileNotFoundError:
-        raise CheckpointError(f"{path} is missing: {way_out}.") from None
-
-
-def _check_progress(values: Mapping[str, Any], update: int, names: Collection[str]) -> None:
-    """Check the position of a run against the name of the folder.
-
-    Raises:
-        ValueError: A position of a different update, or a number that is missing or not finite.
-    """
-    if type(values.get("update")) is not int or values["update"] != update:
-        raise ValueError(f"its update is {str(values.get('update'))[:40]!r}, not {update}")
-    numbers = values.get("numbers")
-    if not isinstance(numbers, dict) or not all(type(v) in (int, float) and math.isfinite(v) for v in numbers.values()):
-        raise ValueError("its numbers are not finite numbers by name")
-    if missing := [name for name in names if name not in numbers]:
-        raise ValueError(f"its progress lacks the number {missing[0]}")
-
-
-def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) -> None:
-    """Check that weights are those of a module, number for number.
-
-    Raises:
-        ValueError: A wrong name, shape or dtype, or a weight that is not finite.
-    """
-    state = module.state_dict()
-    if state.keys() != weights.keys():
-        raise ValueError(f"{name} lacks or adds {min(state.keys() ^ weights.keys())[:80]!r}")
-    for key, value in weights.items():
-        if (value.shape, value.dtype) != (state[key].shape, state[key].dtype):
-            expected = f"{state[key].dtype} {tuple(state[key].shape)}"
-            raise ValueError(f"{key} of {name} is {value.dtype} {tuple(value.shape)}, not {expected}")
-    for key in state.keys() & dict(module.named_parameters()).keys():
-        if not weights[key].isfinite().all():
-            raise ValueError(f"{key} of {name} is not finite")
-
-
-def _parse_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> dict[int, dict[str, Tensor]]:
-    """State of an optimizer by number of the parameter.
-
-    Raises:
-        ValueError: A moment of no parameter, of a wrong shape, or not finite.
-    """
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in moments.items():
-        number, _, name = key.partition(".")
-        index = int(number) if number.isdecimal() and name else -1
-        if not 0 <= index < len(parameters):
-            raise ValueError(f"{key[:40]!r} is no moment of its {len(parameters)} weights")
-        if value.dim() and value.shape != parameters[index].shape:
-            raise ValueError(f"{key[:80]!r} has shape {tuple(value.shape)}, not {tuple(parameters[index].shape)}")
-        if not value.is_floating_point() or not value.isfinite().all():
-            raise ValueError(f"{key[:80]!r} is not finite, or no number")
-        state.setdefault(index, {})[name] = value
-    names = {frozenset(moments_by_name) for moments_by_name in state.values()}
-    if len(names) > 1:
-        raise ValueError("some weights lack moments that others have")
-    return state
