@@ -1,6 +1,7 @@
 """Models with a sampling of their nature: a part of the distribution, of config.json and of the fingerprint."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -131,6 +132,23 @@ def test_a_damaged_sampling_is_refused(truncated, tmp_path, sampling):
         load_policy(str(tmp_path))
 
 
-def test_the_mode_alone_is_no_sampling_of_a_model(full):
+def test_the_mode_alone_is_no_sampling_of_a_model(full, truncated, tmp_path):
     with pytest.raises(ConfigError, match="temperature above 0"):
         SmartPolicy(full.config, full.vocabulary, Sampling(temperature=0.0))
+    truncated.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"sampling": {"temperature": 0.0, "top_k": None}}))
+    with pytest.raises(ConfigError, match=r"config\.json: .*temperature above 0"):
+        load_policy(str(tmp_path))
+
+
+def test_a_temperature_that_makes_logits_infinite_is_refused(full):
+    with pytest.raises(ConfigError, match="not below 1e-30 unless it is 0, got 1e-320"):
+        Sampling(temperature=1e-320)
+    sharp = roll(full, Sampling(temperature=1e-30))
+    assert torch.equal(sharp.position, roll(full, Sampling(temperature=0.0)).position)
+
+
+def test_a_radius_that_nothing_is_in_is_a_setting_like_others(full):
+    alone = SmartPolicy(replace(SMALL, map_radius_m=1e-320, agent_radius_m=1e-9), full.vocabulary).eval()
+    assert roll(alone.requires_grad_(False)).position.isfinite().all()

@@ -360,9 +360,13 @@ def load_network(make: Callable[[], Loaded], weights: Mapping[str, Tensor], *, s
         source: Folder of the weights, which the message of an error names.
 
     Raises:
+        ConfigError: The policy refuses its settings.
         CheckpointError: The weights have other names, shapes or number types, or are not finite.
     """
-    expected = outline(lambda: cast(Any, make()).network)
+    try:
+        expected = outline(lambda: cast(Any, make()).network)
+    except ConfigError as error:
+        raise ConfigError(f"{source / CONFIG}: {error}") from error
     check_shapes(strip_wrappers(weights, expected), expected, source=str(source))
     policy: Any = make()
     load_strictly(policy.network, weights, source=str(source))

@@ -55,6 +55,8 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.vocabulary import Vocabulary
 
 AnyPolicy = TypeVar("AnyPolicy")
+MIN_TEMPERATURE = 1e-30
+"""Lower ones than this make logits infinite in float32."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,10 @@ class Sampling:
 
     def __post_init__(self) -> None:
         check_types(self)
-        if not 0 <= self.temperature < math.inf:
+        if not (self.temperature == 0 or MIN_TEMPERATURE <= self.temperature < math.inf):
             raise ConfigError(
-                f"sampling temperature must be >= 0 and finite, got {self.temperature}: 1 samples, 0 takes the mode."
+                f"sampling temperature must be >= 0 and finite, and not below {MIN_TEMPERATURE:g} unless it is 0, got "
+                f"{self.temperature}: 1 samples, 0 takes the mode."
             )
         if self.top_k is not None and self.top_k < 1:
             raise ConfigError(f"sampling top_k must be >= 1, got {self.top_k}: leave it out to keep all decisions.")

@@ -225,7 +225,7 @@ def tabulate(embedding: FourierEmbedding, reach_m: float, *extra_grids: Grid) ->
     """
     if not (embedding.is_frozen or embedding.training):
         return embedding
-    root = math.sqrt(reach_m)
+    root = math.sqrt(max(reach_m, 1.0))  # a grid has two points
     distance = Grid(0.0, root, round(root * DISTANCES_PER_ROOT_M) + 1, of_roots=True)
     angle = Grid(-math.pi, math.pi, NUM_ANGLES)
     return TabulatedEmbedding.build(embedding, (distance, angle, angle, *extra_grids))
