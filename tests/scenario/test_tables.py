@@ -137,6 +137,14 @@ BAD = {
     "short": ({"tracks": car(7, 0.0, steps=range(50))}, "4.9 s from step 0 on, 9 s are needed"),
     "no ego": ({"scenarios": [{**ROW, "ego_id": 9}]}, "scenarios.parquet: row 0: no ego: object 9 has no rows"),
     "ego gone": ({"scenarios": [{**ROW, "first_step": -20}]}, "no ego: object 7 is not there 1 s after step -20"),
+    "more rows than tracks": (
+        {"scenarios": pa.table({"scenario_id": ["one"] * 200, "ego_id": [7] * 200})},
+        "scenarios.parquet has 200 rows, tracks.parquet only 182: each row makes a scenario",
+    ),
+    "any number of rows": (
+        {"scenarios": pa.table({"scenario_id": pa.repeat("one", 1_000_001), "ego_id": pa.repeat(7, 1_000_001)})},
+        "scenarios.parquet has 1000001 rows, above 1000000: write several folders",
+    ),
     "no rows": ({"scenarios": NONE}, "scenarios.parquet has no rows"),
     "lists": ({"scenarios": [{**ROW, "predict": [["8"]]}]}, "predict is list.*, it must have lists of whole numbers"),
     "texts": ({"lanes": [{**LANE, "exit": ["4"]}]}, "exit is list.*, it must have lists of whole numbers"),

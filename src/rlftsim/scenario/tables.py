@@ -54,6 +54,8 @@ NEAR_LANE_M = 10.0
 WRONG_SIDE = 0.75
 """Road edges that have nearby lanes on their right along more than this fraction run the wrong way."""
 MAX_PREDICTED = 8
+MAX_SCENARIOS = 1_000_000
+"""In a folder; repeated rows take next to no bytes of a file, and any time."""
 SIZE_COLUMNS = ("length", "width", "height")
 _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
@@ -123,6 +125,10 @@ class TablesSource:
         scenarios = tables[SCENARIOS]
         if not len(scenarios):
             raise DataError(f"{SCENARIOS} has no rows: each row makes a scenario")
+        if len(scenarios) > len(tables[TRACKS]):
+            raise DataError(
+                f"{SCENARIOS} has {len(scenarios)} rows, {TRACKS} only {len(tables[TRACKS])}: each row makes a scenario"
+            )
         if "scenario_id" not in tables[MAP] and "map_id" not in scenarios:
             raise DataError(f"{SCENARIOS} has no column map_id, which the maps in {MAP} are named by")
         row_groups = {name: _group_rows(table) for name, table in tables.items() if name != SCENARIOS}
@@ -460,6 +466,8 @@ def _read_table(path: Path) -> Rows:
     """
     missing = f"{path.name}: there is no such table beside {TRACKS}"
     table = read_parquet(path, "write it again", missing=missing)
+    if path.name == SCENARIOS and table.num_rows > MAX_SCENARIOS:
+        raise DataError(f"{path.name} has {table.num_rows} rows, above {MAX_SCENARIOS}: write several folders")
     rows = read_rows(path.name, table, _SCHEMAS[path.name])
     if path.name in (MAP, LANES) and "scenario_id" not in rows and "map_id" not in rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")
