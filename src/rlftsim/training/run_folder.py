@@ -195,7 +195,9 @@ class RunFolder:
         self._settings = {**to_plain(config), **(inputs or {})}
         stored = self._checked_stored_settings(self._settings, may_grow)
         # kept where the same scenarios come as a list this time, or without a validation
-        self._settings = {name: stored[name] for name in (SCENARIO_FILES, HELD_OUT) if name in stored} | self._settings
+        for name in (SCENARIO_FILES, HELD_OUT):
+            if name in stored:
+                self._settings.setdefault(name, stored[name])
         changed = {name: stored[name] for name in may_grow if name in stored and stored[name] != self._settings[name]}
         self.grows_from = changed if self.has_model else {}
         """Settings of the shorter run whose model is here, by name; empty unless it is made longer."""
