@@ -65,6 +65,8 @@ def test_another_frame_is_told_by_scenario_agent_and_distance(warnings_of):
 def test_positions_whose_squares_no_number_holds_are_far(warnings_of):
     states = logged_states(SCENARIO, num_rollouts=1)
     assert "agents do not begin where the log stops" in warnings_of(replace(states, x=states.x + 3e38))[0]
+    later = torch.cat([states.x[..., :40], states.x[..., 40:] + 1e30], -1)
+    assert any("m in 0.1 s in rollout 0" in line for line in warnings_of(replace(states, x=later)))
 
 
 @pytest.mark.parametrize(

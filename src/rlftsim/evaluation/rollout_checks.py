@@ -165,7 +165,8 @@ class PoseChecks:
         dx, dy, facing = np.diff(x[:, rows]), np.diff(y[:, rows]), heading[:, rows, 1:]
         moved = _square(dx, dy)
         is_driving = (moved > (DRIVING_MPS * STEP_S) ** 2) & self.is_judged[rows, 1:] & self.is_judged[rows, :-1]
-        is_askew = (dx * np.cos(facing) + dy * np.sin(facing)) ** 2 < MIN_COSINE**2 * moved
+        forward = dx * np.cos(facing, dtype=np.float64) + dy * np.sin(facing, dtype=np.float64)  # squares fit
+        is_askew = forward**2 < MIN_COSINE**2 * moved
         num_steps = is_driving.sum(-1)  # [N, R]
         drives = num_steps >= MIN_STEPS
         is_contrary = drives & (2 * (is_driving & is_askew).sum(-1) > num_steps)
