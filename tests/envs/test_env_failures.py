@@ -194,7 +194,9 @@ def test_hard_braking_is_seen_in_every_step_of_a_planners_action():
         motion[0, 0, 3] = speed
     world = SimpleNamespace(track=track, step=5)
     episode = SimpleNamespace(world=SimpleNamespace(actors=np.zeros((1, 2), int)), controls=SimpleNamespace(steps=5))
-    view = StepView(episode, SimpleNamespace(world=world), 0)
+    view = object.__new__(StepView)
+    for name, value in (("episode", episode), ("state", SimpleNamespace(world=world)), ("row", 0)):
+        object.__setattr__(view, name, value)
     assert view.acceleration == pytest.approx(-7.0)
     assert EVENTS["hard_braking"].danger(view) == pytest.approx(1.0)
 

@@ -243,7 +243,7 @@ class RankedScenario:
     """What the planner does there, of `CAUSES`."""
 
 
-def is_failure(scores: Mapping[str, float]) -> bool:
+def is_failure(scores: Mapping[str, Any]) -> bool:
     """True where a planner is at fault for a collision or leaves the road, by the scores of an episode, or by means."""
     return scores["at_fault_collision_rate"] > 0 or scores["drivable_area"] < 1
 
