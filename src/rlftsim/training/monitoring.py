@@ -168,15 +168,14 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
         config: Settings of the validation, of which sampling is tried.
 
     Raises:
-        ConfigError: The model cannot simulate, or not with this sampling, or there is no scenario, or a single one to
-            choose the best model by.
+        ConfigError: The model cannot simulate, or not with this sampling, or there is no scenario.
     """
     if not isinstance(model, Policy):
         raise ConfigError(f"{type(model).__name__} cannot simulate, so it cannot be validated: set validation.every=0.")
     if not len(scenarios):
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
     if config.keep_best and len(config.choose(len(scenarios))) < 2:
-        raise ConfigError("a single scenario does not tell the best model: validate on more, or set keep_best=False.")
+        log.warning("a single scenario does not tell the best model: validate on more, or set keep_best=False.")
     if config.top_k is not None:
         frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
         check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
