@@ -15,7 +15,7 @@ from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.planners.registry import Planner, PlannerFailure, guard_planner, load_planner, read_action_settings
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
-from rlftsim.envs.source import Source
+from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED, DriveResult, find_failures, is_failure, rank_scenarios
@@ -55,15 +55,12 @@ class DriveConfig:
         for name in ("num_rollouts", "jobs"):
             whole_number(name, getattr(self, name), 1)
         whole_number("seed", self.seed, 0)
-        if self.limit is not None:
-            whole_number("limit", self.limit, 1)
+        check_choice(self.scenarios, self.limit)
         for traffic in self.traffic or ("",):
             if traffic not in TRAFFIC:
                 raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
         if len(set(self.traffic)) < len(self.traffic):
             raise ConfigError(f"traffic names a type twice: {', '.join(self.traffic)}.")
-        if len(set(self.scenarios or ())) < len(self.scenarios or ()):
-            raise ConfigError(f"scenarios names one twice: {', '.join(self.scenarios or ())}.")
         if self.film is not None and not FILMS.fullmatch(self.film):
             raise ConfigError(f"film must be first, failures, or worst:N such as worst:5, got {in_short(self.film)}.")
 

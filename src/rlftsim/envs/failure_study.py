@@ -26,7 +26,7 @@ import rlftsim
 from rlftsim.envs.dangers import EVENTS, find_event
 from rlftsim.envs.failures import Failure, FailureChain, RepeatedEstimate, make_source
 from rlftsim.envs.planners.registry import Planner, hash_code, load_planner
-from rlftsim.envs.source import Source
+from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.splitting import KILLED
 from rlftsim.errors import ConfigError, DataError, check_types, in_short, whole_number
 from rlftsim.evaluation.scenario_source import hash_manifest
@@ -73,10 +73,7 @@ class StudyConfig:
         check_types(self)
         for name, least in (("particles", 2), ("pilot", 2), ("seed", 0)):
             whole_number(name, getattr(self, name), least)
-        if self.limit is not None:
-            whole_number("limit", self.limit, 1)
-        if len(set(self.scenarios or ())) < len(self.scenarios or ()):
-            raise ConfigError(f"scenarios names one twice: {', '.join(self.scenarios or ())}.")
+        check_choice(self.scenarios, self.limit)
         if self.event not in EVENTS:
             raise ConfigError(f"event {in_short(self.event)}: known are {', '.join(EVENTS)}.")
 

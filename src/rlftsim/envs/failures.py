@@ -62,7 +62,6 @@ class Failure:
 
     def __post_init__(self) -> None:
         check_types(self)
-        object.__setattr__(self, "dice", tuple(self.dice))
         if self.step < 0 or not all(isinstance(number, int) and number >= 0 for number in self.dice):
             raise ConfigError(f"a failure has whole numbers of step and dice, got {in_short([self.step, self.dice])}.")
         if self.contact not in ("", *CollisionType):

@@ -1,7 +1,7 @@
 """Scenarios and the traffic model of an environment, loaded once and shared by all episodes."""
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -10,7 +10,7 @@ from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
-from rlftsim.errors import ConfigError, in_short
+from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -21,6 +21,22 @@ from rlftsim.scenario.types import Scenario, Scenarios, list_scenario_ids
 
 KEPT_CONTEXTS = 16
 """Encoded scenarios that are kept: encoding is most of the cost of a reset."""
+
+
+def check_choice(scenarios: Sequence[str] | None, limit: int | None) -> None:
+    """Check the settings that choose scenarios of a source.
+
+    Args:
+        scenarios: Ids; None = all scenarios.
+        limit: Number of scenarios, the first ones; None = all of them.
+
+    Raises:
+        ConfigError: An id that is named twice, or a limit below 1.
+    """
+    if limit is not None:
+        whole_number("limit", limit, 1)
+    if len(set(scenarios or ())) < len(scenarios or ()):
+        raise ConfigError(f"scenarios names one twice: {', '.join(scenarios or ())}.")
 
 
 class Source:

@@ -14,7 +14,6 @@ Sources: Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic 
 (arXiv 2512.01993).
 """
 
-import copy
 from typing import Any
 
 import torch
@@ -22,6 +21,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.policy import frozen_copy
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.catk_rollouts import roll_out_closest
@@ -54,7 +54,7 @@ class CatkMethod(ImitationMethod[CatkConfig]):
         freeze_untrained(policy, settings.trained)
         learner = super().start(policy, scenarios, settings, fabric)
         if settings.rollouts_of == "epoch":  # without dropout, as a policy that simulates
-            learner.frozen = copy.deepcopy(policy).eval().requires_grad_(False)
+            learner.frozen = frozen_copy(policy)
         return learner
 
     def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:

@@ -11,7 +11,6 @@ low loss may still not read the map: most tokens go straight on or stand still, 
 tokens tell. Vehicles only, since vehicles follow lanes.
 """
 
-import copy
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -26,7 +25,7 @@ from torch.nn import functional
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
-from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling
+from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling, frozen_copy
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import Scenarios
@@ -177,8 +176,7 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
     if config.keep_best and len(config.choose(len(scenarios))) < 2:
         log.warning("a single scenario does not tell the best model: validate on more, or set keep_best=False.")
     if config.top_k is not None:
-        frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
-        check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
+        check_sampling(frozen_copy(model), scenarios, Sampling(top_k=config.top_k))
 
 
 class Validator:
@@ -244,7 +242,7 @@ def validate(
 
     start = time.perf_counter()
     # A copy, so that neither the mode nor a cache of the model in training changes.
-    frozen: Any = copy.deepcopy(model).eval().requires_grad_(False)
+    frozen: Any = frozen_copy(model)
     # Dealt out in turn: the same scenarios in total for any number of processes.
     choice = config.choose(len(scenarios))
     selected = choice[fabric.global_rank :: fabric.world_size]
