@@ -67,6 +67,17 @@ def test_what_a_living_process_or_another_program_writes_stays(tmp_path):
     assert all((tmp_path / name).exists() for name in others)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
+def test_a_temporary_of_a_process_whose_exit_status_nobody_collects_goes(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""], stdout=subprocess.PIPE) as process:
+        temporary = tmp_path / f".a.json.{socket.gethostname()}.{process.pid}.tmp"
+        temporary.touch()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and stays in the list
+        os.kill(process.pid, 0)
+        remove_temporaries([tmp_path / "a.json"])
+        assert not temporary.exists()
+
+
 def test_an_interrupted_write_leaves_nothing(tmp_path):
     def stopped(path):
         path.write_text("half")

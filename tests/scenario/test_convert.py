@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -298,7 +299,7 @@ def test_an_interrupted_conversion_goes_on_and_gives_the_same_bytes(many, tmp_pa
     assert process.returncode != 0
     with pytest.raises(DataError, match="was not finished"):
         ScenarioDataset(destination)
-    wait_for_orphans(destination)
+    wait_for_orphans(process)
 
     report = run(many, destination)
     assert report.converted == 96
@@ -309,11 +310,20 @@ def test_an_interrupted_conversion_goes_on_and_gives_the_same_bytes(many, tmp_pa
     assert not any(finding.problem.is_damage for finding in verify_dataset(destination))
 
 
-def wait_for_orphans(destination):
-    """Workers of a killed process end by themselves; from then on nothing in the folder changes."""
-    before = None
-    while before != (before := sorted(destination.rglob("*"))):
-        time.sleep(0.5)
+def wait_for_orphans(process):
+    """Workers of a killed process end by themselves, at the latest after the shard that they write."""
+    deadline = time.monotonic() + 240
+    while any(process.pid == group and state != "Z" for state, group in list_processes()):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.1)
+
+
+def list_processes():
+    """State and process group of each process."""
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it has just ended
+            state, _, group, *_ = path.read_text().rpartition(")")[2].split()
+            yield state, int(group)
 
 
 @pytest.mark.official

@@ -145,15 +145,22 @@ def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:
     if name == name_and_host:  # of another machine, whose name may have dots as the file's may
         words = name.split(".")
         return any(".".join(words[:number]) in names for number in range(1, len(words)))
-    if name in names and process != os.getpid() and os.name == "posix":  # elsewhere the question ends the process
-        try:
-            os.kill(process, 0)
-        except (ProcessLookupError, OverflowError):
-            return True
-        except PermissionError:
-            pass
+    is_asked = process != os.getpid() and os.name == "posix"  # elsewhere the question ends the process
+    return name in names and not (is_asked and _is_running(process))
+
+
+def _is_running(process: int) -> bool:
+    """True for a process of this machine that has not ended."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
         return False
-    return name in names
+    except PermissionError:
+        return True
+    # in containers nobody collects the exit status of orphans, which stay in the list of processes for good
+    with suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return True
 
 
 def remove_folder(folder: Path, names: Collection[str]) -> None:
