@@ -20,7 +20,10 @@ from rlftsim.envs.drive_scenario import DriveConfig, choose_films, run_planner, 
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, compute_idm_acceleration
 from rlftsim.envs.planner_scores import off_road
+from rlftsim.envs.planners import pdm
 from rlftsim.envs.planners.registry import PLANNERS, hash_code, load_planner, read_action_settings
+from rlftsim.envs.planners.view import View
+from rlftsim.envs.route import compute_headings
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import resumable
 from rlftsim.evaluation.drive_results import (
@@ -82,6 +85,26 @@ def test_planners_follow_a_bending_lane():
         assert result.planner.drivable_area == 1.0
         assert result.planner.progress > 0.9
         assert result.planner.displacement_error < 15.0
+
+
+def test_boxes_that_no_proposal_comes_near_change_no_bit(monkeypatch):
+    rng = np.random.default_rng(3)
+    line = np.stack([np.arange(120.0), 8 * np.sin(np.arange(120.0) / 20)], -1)
+    heading = np.unwrap(compute_headings(line))
+    num_near = 0
+    for speed in (0.0, 4.0, 12.0):
+        boxes = rng.uniform([-20, -40, -4, -12, -12], [120, 40, 4, 12, 12], (40, 5))
+        sizes = rng.uniform([0.6, 0.6], [12.0, 3.0], (40, 2))
+        view = View(speed, np.array([4.6, 1.9]), line, heading, 13.0, boxes, sizes, np.inf, np.zeros((0, 4)))
+        is_near = pdm._nears_line(view)
+        num_near += is_near.sum()
+        proposals = pdm.simulate_proposals(view)
+        with monkeypatch.context() as context:
+            context.setattr(pdm, "_nears_line", lambda view: np.ones(len(view.boxes), bool))
+            every_box = pdm.simulate_proposals(view)
+        np.testing.assert_array_equal(proposals.motion, every_box.motion)
+        np.testing.assert_array_equal(proposals.controls, every_box.controls)
+    assert 15 < num_near < 115  # some are left out, and some matter
 
 
 def test_the_intelligent_driver_model_has_its_equilibrium():

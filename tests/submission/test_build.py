@@ -194,6 +194,16 @@ def test_a_receipt_of_another_file_counts_for_nothing(data, tmp_path):
     assert (tmp_path / "mine.txt").read_text() == "of a user"
 
 
+@pytest.mark.parametrize("damage", [{"raw_size": -1}, {"size": -(2**70)}, {"raw_crc": 2**60}, {"piece_crc": "x"}])
+def test_a_receipt_that_cannot_be_counts_for_nothing(data, tmp_path, damage):
+    build(data, tmp_path)
+    job = entries.make_job(data, tmp_path, num_shards=NUM_SHARDS)
+    path = job.receipt_path(0)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **damage}))
+    assert job.receipt(0) is None
+    assert job.receipt(1) is not None
+
+
 def test_another_plan_is_refused_with_its_difference(data, tmp_path):
     build(data, tmp_path)
     with pytest.raises(ConfigError, match="holds a submission of another seed: name another --out"):

@@ -21,7 +21,7 @@ from rlftsim.envs.actions import (
     signed_speed,
     to_heading_frame,
 )
-from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration, find_leaders
+from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, choose_leaders, compute_idm_acceleration, find_meetings
 from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
 from rlftsim.envs.planners.view import View, read_view
 from rlftsim.envs.road import OUTSIDE_M, nearest_edges
@@ -81,19 +81,27 @@ def simulate_proposals(view: View) -> Proposals:
     """Drive along the route at several speeds and offsets for 4 s; all other agents keep a constant velocity."""
     fraction, offset = (v.ravel() for v in np.meshgrid(SPEED_FRACTIONS, OFFSETS_M))
     free_speed = fraction * (view.limit_mps or CONFIG.speed_mps)
-    n, bicycle = len(free_speed), Bicycle()
+    n, num_lines, bicycle = len(free_speed), len(OFFSETS_M), Bicycle()
+    row, line_row = np.arange(n), np.repeat(np.arange(num_lines), len(SPEED_FRACTIONS))
     normal = np.stack([-np.sin(view.heading), np.cos(view.heading)], -1)
     lines = view.line + offset[:, None, None] * normal  # [n, P, 2]
     motion = np.tile([0.0, 0.0, 0.0, view.speed, 0.0], (n, 1))
-    row, size = np.arange(n), np.tile(view.size, (n, 1))
-    mask, other_size = np.ones((n, len(view.boxes)), bool), np.tile(view.box_size, (n, 1, 1))
+    # the five proposals of an offset share a line, so boxes meet lines and not proposals
+    shared_lines, headings = lines[:: len(SPEED_FRACTIONS)], np.tile(view.heading, (num_lines, 1))
+    width, length = np.full(num_lines, view.size[1]), np.full(n, view.size[0])
+    is_near = _nears_line(view)
+    near_boxes, near_size = view.boxes[is_near], np.tile(view.box_size[is_near], (num_lines, 1, 1))
     states, controls = [motion], []
     for step in range(STEPS):
-        boxes = np.tile(_coasted(view.boxes, step * STEP_S), (n, 1, 1))
+        boxes = np.tile(_coasted(near_boxes, step * STEP_S), (n, 1, 1))
         # 1. place on the line, and the leader from there on
-        line_index = np.linalg.norm(lines - motion[:, None, :2], axis=-1).argmin(1)
+        line_index = _measure_distance(lines, motion[:, None]).argmin(1)
         window = np.minimum(line_index[:, None] + np.arange(LOOKAHEAD_M), lines.shape[1] - 1)
-        gap, lead = find_leaders(lines[row[:, None], window], view.heading[window], size, boxes, other_size, mask)
+        gap, lead = np.full(n, np.inf), np.zeros(n)
+        if len(near_boxes):
+            meets = find_meetings(shared_lines, headings, width, boxes[:num_lines], near_size)[line_row]
+            meets = np.take_along_axis(meets, window[:, None], 2)  # [n, K, W]
+            gap, lead = choose_leaders(meets, view.heading[window], length, boxes)
         to_stop = view.stop_m - line_index - view.size[0] / 2
         to_stop = np.where(to_stop > -1.0, np.maximum(to_stop, 0.0), np.inf)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
@@ -135,7 +143,7 @@ def score_proposals(
     n = len(motion)
     # 1. what must not happen: collisions, driving against the route, leaving the road
     end = motion[:, -1]
-    line_index = np.linalg.norm(view.line - end[:, None, :2], axis=-1).argmin(1)
+    line_index = _measure_distance(view.line, end[:, None]).argmin(1)
     direction = np.cos(end[:, 2] - view.heading[line_index]) > 0
     sparse = motion[:, ::SPARSE]
     allowed = ~collides[:, -1] & direction & ~_leaves_road(view, sparse)
@@ -178,6 +186,24 @@ def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndar
     corners = clockwise_corners(motion[..., :2], motion[..., 2], view.size).reshape(len(motion), -1, 2)  # [n, 4 t, 2]
     distance, side, _ = nearest_edges(corners, view.edges[None])
     return np.any((side < 0) & (distance >= OUTSIDE_M), axis=1)
+
+
+def _nears_line(view: View) -> Bool[np.ndarray, "K"]:
+    """True for boxes that may meet a proposal's line within the time of the proposals."""
+    boxes = np.stack([_coasted(view.boxes, STEP_S * step) for step in range(0, STEPS + SPARSE, SPARSE)])  # [t, K, 5]
+    distance = _measure_distance(boxes[:, :, None], view.line).min((0, 2), initial=np.inf)
+    # between two sparse steps a box is at most half of its way from one of them
+    distance -= SPARSE * STEP_S / 2 * np.hypot(*view.boxes[:, 3:].T)
+    reach = np.linalg.norm(view.box_size + view.size[1], axis=-1) / 2 + max(OFFSETS_M)
+    return distance <= reach + 1e-6
+
+
+def _measure_distance(
+    points: Float[np.ndarray, "*#m x"], others: Float[np.ndarray, "*#m y"]
+) -> Float[np.ndarray, "*m"]:
+    """Distance between points, of which x and y come first, m."""
+    x, y = points[..., 0] - others[..., 0], points[..., 1] - others[..., 1]
+    return np.sqrt(x * x + y * y)
 
 
 def _coasted(boxes: Float[np.ndarray, "K 5"], time_s: float) -> Float[np.ndarray, "K 5"]:
