@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.experiments.goal_proposals import road_test
-from rlftsim.goals.maneuvers.lane_paths import BRISK, HORIZON_S
-from rlftsim.goals.maneuvers.proposals import (
+from rlftsim.goals.lane_paths import BRISK, HORIZON_S
+from rlftsim.goals.proposals import (
     CurrentAgent,
     Proposal,
     logged_maneuver,

@@ -264,7 +264,7 @@ def test_an_edited_goal_is_refused_before_anything_is_trained(goals, message, su
 
 
 def made_up_proposals(scenario, track):
-    from rlftsim.goals.maneuvers.proposals import Proposal
+    from rlftsim.goals.proposals import Proposal
     from rlftsim.scenario.maneuver import Maneuver
 
     way = scenario.tracks.position[track, 10:, :].astype(np.float64)

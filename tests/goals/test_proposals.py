@@ -7,9 +7,9 @@ import pytest
 from junction import BACK, BESIDE, DOUBLE_LINE, LANE, driving, relative
 
 import scenes
-from rlftsim.goals.maneuvers import lane_paths
-from rlftsim.goals.maneuvers.lane_paths import Pose, compute_reach, lanes_for, neighbor_lanes, path_through, paths_from
-from rlftsim.goals.maneuvers.proposals import CurrentAgent, logged_maneuver, no_proposal_reason, propose_from_lanes
+from rlftsim.goals import lane_paths
+from rlftsim.goals.lane_paths import Pose, compute_reach, lanes_for, neighbor_lanes, path_through, paths_from
+from rlftsim.goals.proposals import CurrentAgent, logged_maneuver, no_proposal_reason, propose_from_lanes
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import Maneuver, classify_turn
 from rlftsim.scenario.types import MapFeatures, ObjectType

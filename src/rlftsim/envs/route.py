@@ -13,8 +13,8 @@ from rlftsim.envs.levels import is_on_level
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import wrapped
-from rlftsim.goals.maneuvers.lane_paths import MAX_LANE_DISTANCE_M, LanePath, lane_change_paths, lanes_for
-from rlftsim.goals.maneuvers.proposals import CurrentAgent, own_paths, propose_from_lanes
+from rlftsim.goals.lane_paths import MAX_LANE_DISTANCE_M, LanePath, lane_change_paths, lanes_for
+from rlftsim.goals.proposals import CurrentAgent, own_paths, propose_from_lanes
 from rlftsim.scenario.lane_graph import LaneGraph
 from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, cached_on_scenario

@@ -8,7 +8,7 @@ import torch
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
-from rlftsim.goals.maneuvers.lane_paths import HORIZON_S
+from rlftsim.goals.lane_paths import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.progress import progress_bar

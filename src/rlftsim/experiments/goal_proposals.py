@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.goals.maneuvers.proposals import Proposal, RoadTest, logged_maneuver, propose_from_lanes
+from rlftsim.goals.proposals import Proposal, RoadTest, logged_maneuver, propose_from_lanes
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS

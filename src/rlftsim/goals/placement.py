@@ -7,7 +7,7 @@ import numpy as np
 from rlftsim.errors import DataError
 from rlftsim.goals.attainment import NEAR_M
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.goals.maneuvers.lane_paths import BRISK, HORIZON_S
+from rlftsim.goals.lane_paths import BRISK, HORIZON_S
 from rlftsim.goals.types import Goals, goals_at, simulated_track
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, ObjectType, Scenario

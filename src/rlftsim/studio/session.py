@@ -14,8 +14,8 @@ import rlftsim
 from rlftsim.errors import DataError
 from rlftsim.experiments.goal_proposals import format_label, propose, to_goal_entry
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.goals.maneuvers.proposals import no_proposal_reason
 from rlftsim.goals.placement import goal_warnings
+from rlftsim.goals.proposals import no_proposal_reason
 from rlftsim.goals.types import simulated_track
 from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.registry import Device

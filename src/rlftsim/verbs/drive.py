@@ -1,6 +1,5 @@
 """`rlftsim drive`: a planner among simulated traffic."""
 
-import sys
 from pathlib import Path
 
 from rlftsim.evaluation.drive_results import FAILED, format_drives, format_worst, rank_scenarios
@@ -55,8 +54,6 @@ def drive(
     from rlftsim.envs import drive as driving
     from rlftsim.envs.drive_scenario import choose_films, write_film
 
-    # As `python -m` does, so that a planner in a file of this folder is found.
-    sys.path.insert(0, "")
     config = driving.DriveConfig(
         planner=planner, data=data, split=split, model=model,
         traffic=tuple(driver.strip() for driver in traffic.split(",")),

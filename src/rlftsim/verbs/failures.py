@@ -1,6 +1,5 @@
 """`rlftsim failures`: how often a planner fails in realistic traffic, and the failures as films."""
 
-import sys
 from pathlib import Path
 from typing import Literal
 
@@ -59,8 +58,6 @@ def failures(
     from rlftsim.envs.failure_run import run_study
     from rlftsim.envs.failure_study import STEPS_PER_S, StudyConfig, parse_budget
 
-    # As `python -m` does, so that a planner in a file of this folder is found.
-    sys.path.insert(0, "")
     whole_number("jobs", jobs, 1)
     whole_number("films", films, 0)
     config = StudyConfig(
@@ -91,7 +88,6 @@ def show_failure(folder: Path, number: int, *, film: Path | None = None) -> None
     from rlftsim.envs.failure_study import read_failure
     from rlftsim.envs.result import Result
 
-    sys.path.insert(0, "")
     config, failure = read_failure(folder, number)
     exhibit = build_exhibit(config, number, failure)
     for name, text in exhibit.facts().items():

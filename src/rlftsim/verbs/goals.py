@@ -10,8 +10,8 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.goal_proposals import format_label, propose, to_goal_entry
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, check_single_goals, parse_goal, read_goals, write_goals
-from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
+from rlftsim.goals.proposals import Proposal, no_proposal_reason
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_line, print_wide
 from rlftsim.rollout.policy import Policy, is_goal_conditioned

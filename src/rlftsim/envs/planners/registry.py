@@ -90,6 +90,8 @@ def load_planner(name: str) -> Planner:
         module, _, attribute = location.partition(":")
         if not module or module.startswith("."):
             raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
+        if "" not in sys.path:
+            sys.path.insert(0, "")  # a planner in a file of this folder is found, as by `python -m`
         try:
             loaded = getattr(importlib.import_module(module), attribute)
         except (Exception, SystemExit) as error:  # a file of others may fail in any way

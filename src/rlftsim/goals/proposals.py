@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.goals.maneuvers.lane_paths import (
+from rlftsim.goals.lane_paths import (
     BRISK,
     HORIZON_S,
     LONGEST_UTURN_M,
