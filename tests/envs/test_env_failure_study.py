@@ -1,6 +1,7 @@
 """Failures over many scenarios: the budget's shares, resuming to the same bytes, the page, and the command line."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from rlftsim.cli.main import main
 from rlftsim.envs.failure_page import brake, build_exhibit
 from rlftsim.envs.failure_study import (
+    NUMBERS_PER_ROUND,
     Pilot,
     ScenarioEstimate,
     Study,
@@ -19,6 +21,19 @@ from rlftsim.envs.failure_study import (
 from rlftsim.envs.failures import Repeat
 from rlftsim.errors import ConfigError, DataError
 
+UNLUCKY = """
+class Unlucky:
+    def reset(self, info):
+        self.is_first = info["scenario"] == "{scenario_id}"
+
+    def seed(self, number):
+        self.number = number
+
+    def act(self, observation):
+        if self.is_first and self.number >= {first_number}:
+            raise IndexError("no lane")
+        return [0.0, 0.0]
+"""
 # a planner that does not look, in traffic that stops: it fails soon, and often
 LINE = ["failures", "constant_velocity", "--data", "synthetic", "--limit", "2", "--particles", "2", "--budget", "8000"]
 
@@ -77,6 +92,17 @@ def test_the_total_is_a_stratified_mean():
         1 - 0.05 ** (1 / 32)
     )
     assert math.isnan(Study(StudyConfig("idm"), (estimate(0.1), estimate(0.2, 0.3)), {}).mean_interval()[1])
+
+
+def test_a_planner_that_fails_after_the_pilot_loses_the_scenario_and_no_other(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    first, second = StudyConfig("idm", limit=2).scenario_ids()
+    Path("unlucky.py").write_text(UNLUCKY.format(scenario_id=first, first_number=NUMBERS_PER_ROUND))
+    assert main(["failures", "unlucky:Unlucky", *LINE[2:], "--out", "failures", "--films", "0"]) == 0
+    printed = capsys.readouterr().out
+    assert f"left out: planner Unlucky fails at step 0 of scenario {first}: IndexError: no lane" in printed
+    assert second in printed
+    assert "per 1 000 km" in printed
 
 
 def test_however_the_work_is_done_and_interrupted_the_bytes_are_the_same(tmp_path, capsys):

@@ -81,17 +81,23 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         for pilot, (count, is_branching) in zip(pilots, plan) for number in range(1, count + 1)
     ]  # fmt: skip
     names = [item.name for item in items]
-    rounds: list[tuple[Repeat, ...]] = _measure(
+    rounds: list[tuple[Repeat, ...] | str] = _measure(
         f"failures of {config.planner}",
         ScenarioValues(out / "repeats", names, _agree(names, identity), _read_round),
         partial(_drive_round, config, items),
         _show_estimate(runner(len(items)), out / "repeats"),
     )
     repeats: dict[str, list[Repeat]] = {pilot.scenario_id: [] for pilot in pilots}
-    for item, finished in zip(items, rounds):
-        repeats[item.scenario_id].extend(finished)
-    estimates = [ScenarioEstimate(tuple(repeats[p.scenario_id]), config.particles, p) for p in pilots]
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
+    for item, finished in zip(items, rounds):
+        if isinstance(finished, str):
+            problems[item.scenario_id] = finished
+        else:
+            repeats[item.scenario_id].extend(finished)
+    measured = [pilot for pilot in pilots if pilot.scenario_id not in problems]
+    if not measured:
+        raise DataError(problems[pilots[0].scenario_id])
+    estimates = [ScenarioEstimate(tuple(repeats[p.scenario_id]), config.particles, p) for p in measured]
     study = Study(config, tuple(estimates), problems)
     study.write(out / FAILURES)
     remove_temporaries([out / ABOUT, out / FAILURES])  # of processes that were killed
@@ -139,11 +145,17 @@ def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:
 def _drive_round(config: StudyConfig, items: Sequence[_Round], position: int) -> dict[str, object]:
     item = items[position]
     episodes = config.chain(item.scenario_id, item.number)
-    repeats = episodes.estimate(config.particles, REPEATS, is_branching=item.is_branching)
+    try:
+        repeats = episodes.estimate(config.particles, REPEATS, is_branching=item.is_branching)
+    except PlannerFailure as error:  # without this repeat the estimate would be biased: the scenario is left out
+        return {"probability": 0.0, "repeats": [], "problem": str(error)}
     return {"probability": float(np.mean([r.probability for r in repeats])), "repeats": [asdict(r) for r in repeats]}
 
 
-def _read_round(name: str, values: Mapping[str, Any]) -> tuple[Repeat, ...]:
+def _read_round(name: str, values: Mapping[str, Any]) -> tuple[Repeat, ...] | str:
+    """Repeats of a round, or what the planner did wrong."""
+    if problem := values.get("problem"):
+        return str(problem)
     repeats = tuple(
         _build(Repeat, {**repeat, "failures": tuple(_build(Failure, failure) for failure in repeat["failures"])})
         for repeat in values["repeats"]
