@@ -194,6 +194,18 @@ def test_a_receipt_of_another_file_counts_for_nothing(data, tmp_path):
     assert (tmp_path / "mine.txt").read_text() == "of a user"
 
 
+@pytest.mark.parametrize(
+    "damage", [{"raw_size": -(2**70)}, {"raw_size": 2**70}, {"raw_crc": -1}, {"raw_crc": 2**40}, {"size": -5}]
+)
+def test_a_receipt_with_impossible_numbers_counts_for_nothing(damage, data, whole, tmp_path):
+    job = entries.make_job(data, tmp_path, num_shards=NUM_SHARDS)
+    with pytest.raises(Unfinished):
+        build_archive(job, runner=Share(1, 2, Inline()), show_progress=False)
+    receipt = job.receipt_path(0)
+    receipt.write_text(json.dumps(json.loads(receipt.read_text()) | damage))
+    assert build(data, tmp_path).read_bytes() == whole
+
+
 def test_another_plan_is_refused_with_its_difference(data, tmp_path):
     build(data, tmp_path)
     with pytest.raises(ConfigError, match="holds a submission of another seed: name another --out"):

@@ -189,7 +189,9 @@ class Job:
             check_types(shard)
         except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
-        return shard if shard.file == self.shard_path(number).name else None
+        sizes, sums = (shard.size, shard.raw_size), (shard.piece_crc, shard.raw_crc)
+        fits = min(*sizes, *sums) >= 0 and max(sizes) < 1 << 50 and max(sums) < 1 << 32
+        return shard if fits and shard.file == self.shard_path(number).name else None
 
 
 def prepare_job(
