@@ -1,4 +1,4 @@
-"""SIGTERM and SIGUSR1 do what Ctrl-C does, with exit statuses of their own."""
+"""SIGTERM, SIGHUP and SIGUSR1 do what Ctrl-C does, with exit statuses of their own."""
 
 import os
 import signal
@@ -25,7 +25,10 @@ def _handlers_of_a_new_process():
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGUSR1, 138)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138)],
+)
 def test_a_signal_ends_a_command_in_one_line_with_its_status(number, status, monkeypatch, capsys):
     handlers = [signal.getsignal(one) for one in SIGNALS]
     monkeypatch.setattr("rlftsim.verbs.plugins.plugins", lambda: signal.raise_signal(number))
@@ -51,7 +54,7 @@ def make_update(*numbers, done):
         done.append(is_stopped())
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1])
 def test_an_update_that_has_begun_is_finished_first(number):
     done = []
     with pytest.raises(Interruption) as caught:
@@ -87,7 +90,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1"])
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR1"])
 def test_worker_processes_end_silently_with_the_one_that_started_them(name, tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT.format(name=name))
     done = subprocess.run(

@@ -88,8 +88,10 @@ def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
         assert {k: mine[k] for k in timeless} == {k: other[k] for k in timeless}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
-def test_a_signal_of_slurm_keeps_the_update_that_has_begun(number, vocabulary, drawn_scenarios, tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1])
+def test_a_signal_of_slurm_or_of_a_closed_terminal_keeps_the_update_that_has_begun(
+    number, vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
     stop_at(monkeypatch, "pretrain", 1, presses=1, number=number)
     with signals_like_ctrl_c(), pytest.raises(Interruption, match="continues behind update 1"):
         train("pretrain", vocabulary, drawn_scenarios, tmp_path, epochs=1.25, batch_size=1)

@@ -1,4 +1,5 @@
-"""Signals that end a command: Ctrl-C, SIGTERM, and SIGUSR1, which SLURM sends before the time of a job is over.
+"""Signals that end a command: Ctrl-C, SIGTERM, SIGHUP of a terminal that closes, and SIGUSR1, which SLURM sends
+before the time of a job is over.
 
 Each raises a KeyboardInterrupt in the main thread of the process that a user started, never in child processes: the
 main process ends its children.
@@ -11,8 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name))
-"""Ctrl-C and what is like it. Windows has no SIGUSR1."""
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name))
+"""Ctrl-C and what is like it. Windows has neither SIGHUP nor SIGUSR1."""
 log = logging.getLogger("rlftsim")
 
 
@@ -35,7 +36,7 @@ def raise_interruption(number: int, *_: object) -> None:
 
 @contextmanager
 def signals_like_ctrl_c() -> Iterator[None]:
-    """Context in which SIGTERM and SIGUSR1 interrupt as Ctrl-C does, instead of ending the process at once.
+    """Context in which SIGTERM, SIGHUP and SIGUSR1 interrupt as Ctrl-C does, instead of ending the process at once.
 
     Outside of the main thread all signals stay unchanged, as does a signal that is ignored or has a handler of the
     caller's.

@@ -5,6 +5,7 @@ validated: a wrong offset is followed out of the file, which ends the process.
 """
 
 import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike, fspath, stat
@@ -16,10 +17,11 @@ import pyarrow.parquet as pq
 from rlftsim.errors import DataError, RlftsimError
 from rlftsim.jobs.documents import check_has_end, first_line
 
-MAX_VALUES = 1 << 27
-"""Values that a Parquet file may hold, however small it is: 1 GiB of numbers."""
+MAX_VALUES = 1 << 25
+"""Values that a Parquet file may hold, however small it is: 256 MiB of numbers."""
 MAX_VALUES_PER_BYTE = 100
 """Values a byte of a larger Parquet file; columns that hardly vary are packed far better than others."""
+MAX_COLUMNS = 10_000
 MAX_TABLE_BYTES, MAX_BYTES_PER_BYTE = 3 << 29, 16
 """Memory that reading a Parquet file may take, and the same for each byte of the file: repeated values are packed a
 million times smaller."""
@@ -149,9 +151,9 @@ def _limited_memory(num_bytes: int) -> Iterator[None]:
 def _validate_table(table: pa.Table) -> pa.Table:
     names = table.schema.names  # decoded here
     table.validate(full=True)
-    repeated = [name for name in names if names.count(name) > 1]
-    if repeated:
-        raise ValueError(f"two columns {repeated[0][:40]!r}")
+    name, count = next(iter(Counter(names).most_common(1)), ("", 0))
+    if count > 1:
+        raise ValueError(f"two columns {name[:40]!r}")
     return table
 
 
@@ -180,6 +182,8 @@ def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:
     """Check that values can be in a file: a few bytes may announce as many as memory cannot hold."""
     # not by the metadata of columns: a damaged one ends the process as soon as pyarrow looks at it
     num_rows = sum(metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
+    if metadata.num_columns > MAX_COLUMNS:
+        raise ValueError(f"it has {metadata.num_columns} columns, above {MAX_COLUMNS}")
     announced = max(num_rows, metadata.num_rows) * metadata.num_columns
     if announced > max(MAX_VALUES, MAX_VALUES_PER_BYTE * num_bytes):
         raise ValueError(f"it announces {announced:.3g} values in {num_bytes} bytes")

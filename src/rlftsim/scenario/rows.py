@@ -16,6 +16,8 @@ Schema = tuple[Mapping[str, str], Mapping[str, str]]
 Contents are the words of `_read_column`. "text or nothing" and lists may have empty cells; empty numbers are NaN, an
 error where it matters.
 """
+MAX_OBJECT_BYTES = 1 << 24
+"""Distinct texts, or lists, in a column: as Python objects they take ten times as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +108,21 @@ def _read_column(table: str, name: str, column: pa.ChunkedArray, content: str) -
             return column.cast(pa.int64()).to_numpy()
         if content == "True or False":
             return column.to_numpy()
-        values = np.empty(len(column), object)
-        values[:] = column.to_pylist()
-        if content in ("text", "text or nothing"):
-            values[:] = [None if value is None else str(value) for value in values]
-        return values
-    except pa.ArrowException as error:
+        if content.startswith("lists"):
+            values = np.empty(len(column), object)
+            values[:] = _to_objects(column)
+            return values
+        # equal texts are one object, so that a repeated text takes a pointer
+        cells = column.dictionary_encode().combine_chunks()
+        texts = _to_objects(cells.dictionary)
+        if not content.startswith("names"):
+            texts = [str(text) for text in texts]
+        return np.array([*texts, None], object)[cells.indices.fill_null(len(texts))]
+    except (pa.ArrowException, OverflowError) as error:
         raise DataError(f"{table}: column {name}: {error}") from None
+
+
+def _to_objects(values: pa.Array | pa.ChunkedArray) -> list[Any]:
+    if values.nbytes > MAX_OBJECT_BYTES:
+        raise OverflowError(f"{values.nbytes / 1e6:.0f} MB of texts or lists, above {MAX_OBJECT_BYTES >> 20} MiB")
+    return values.to_pylist()

@@ -54,8 +54,8 @@ NEAR_LANE_M = 10.0
 WRONG_SIDE = 0.75
 """Road edges that have nearby lanes on their right along more than this fraction run the wrong way."""
 MAX_PREDICTED = 8
-MAX_SCENARIOS = 1_000_000
-"""In a folder; repeated rows take next to no bytes of a file, and any time."""
+MAX_ROWS = 1_000_000
+"""Of scenarios in a folder, and of a table in a scenario; repeated rows take next to no bytes of a file."""
 SIZE_COLUMNS = ("length", "width", "height")
 _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
@@ -420,9 +420,10 @@ def _check_numbers(rows: Rows) -> None:
 def _check_repeated(rows: Rows, *names: str) -> None:
     """Raise a `DataError` at the first row that repeats the values of an earlier row in some columns."""
     columns = [rows[name] for name in names]
-    _, first, owner = np.unique(np.column_stack(columns), axis=0, return_index=True, return_inverse=True)
     cells = ", ".join(f"{name} {{}}" for name in names)
-    is_repeated = first[owner.reshape(-1)] != np.arange(len(rows))
+    order = np.lexsort(columns)
+    is_repeated = np.zeros(len(rows), bool)
+    is_repeated[order[1:]] = np.all([np.diff(column[order]) == 0 for column in columns], axis=0)
     rows.check(is_repeated, f"a second row with {cells}: every row needs its own", *columns)
 
 
@@ -430,8 +431,8 @@ def _read_numbers(rows: Rows, name: str, enumeration: type[IntEnum]) -> Int64[np
     """Numbers of a column that holds numbers or names."""
     numbers: dict[Any, int] = {member.name.lower(): int(member) for member in enumeration}
     numbers |= {int(member): int(member) for member in enumeration}
-    values, inverse = np.unique(rows[name], return_inverse=True)
-    plain = [value.lower() if isinstance(value, str) else int(value) for value in values.tolist()]
+    values, inverse = _number_keys(rows[name])
+    plain = [value.lower() if isinstance(value, str) else value for value in values]
     for index, value in enumerate(plain):
         if value not in numbers:
             words = ", ".join(member.name.lower() for member in enumeration)
@@ -441,21 +442,34 @@ def _read_numbers(rows: Rows, name: str, enumeration: type[IntEnum]) -> Int64[np
 
 def _group(keys: np.ndarray) -> list[tuple[Any, Int64[np.ndarray, "_"]]]:
     """Each distinct key in ascending order, with the indices of all occurrences."""
-    values, counts = np.unique(keys, return_counts=True)
-    order = np.argsort(keys, kind="stable")
+    values, numbers = _number_keys(keys)
+    order, counts = np.argsort(numbers, kind="stable"), np.bincount(numbers)
     return list(zip(values, np.split(order, np.cumsum(counts)[:-1])))
+
+
+def _number_keys(keys: np.ndarray) -> tuple[list[Any], Int64[np.ndarray, "n"]]:
+    """Distinct keys in ascending order, and the number of each key in that order."""
+    if keys.dtype != object:
+        values, numbers = np.unique(keys, return_inverse=True)
+        return values.tolist(), numbers
+    values = sorted(set(keys))
+    number = {value: index for index, value in enumerate(values)}
+    return values, np.fromiter(map(number.__getitem__, keys), np.int64, len(keys))
 
 
 def _group_rows(table: Rows) -> dict[tuple[str, str], np.ndarray]:
     """Rows of a table by scenario or map: by the name of the key column, and the id."""
     keys = [key for key in ("scenario_id", "map_id") if key in table]
-    return {(key, str(value)): indices for key in keys for value, indices in _group(table[key].astype(str))}
+    return {(key, value): indices for key in keys for value, indices in _group(table[key])}
 
 
 def _select_rows(table: Rows, row_groups: Mapping[tuple[str, str], np.ndarray], row: Rows) -> Rows:
     """Rows of a table that belong to a scenario, by scenario id or map id."""
     keys = [(key, str(row[key][0])) for key in ("scenario_id", "map_id") if key in row and key in table]
-    return table.take(next((row_groups[key] for key in keys if key in row_groups), np.zeros(0, np.int64)))
+    indices = next((row_groups[key] for key in keys if key in row_groups), np.zeros(0, np.int64))
+    if len(indices) > MAX_ROWS:
+        raise DataError(f"{table.table} has {len(indices)} rows of the scenario, above {MAX_ROWS}: write fewer")
+    return table.take(indices)
 
 
 def _read_table(path: Path) -> Rows:
@@ -466,8 +480,8 @@ def _read_table(path: Path) -> Rows:
     """
     missing = f"{path.name}: there is no such table beside {TRACKS}"
     table = read_parquet(path, "write it again", missing=missing)
-    if path.name == SCENARIOS and table.num_rows > MAX_SCENARIOS:
-        raise DataError(f"{path.name} has {table.num_rows} rows, above {MAX_SCENARIOS}: write several folders")
+    if path.name == SCENARIOS and table.num_rows > MAX_ROWS:
+        raise DataError(f"{path.name} has {table.num_rows} rows, above {MAX_ROWS}: write several folders")
     rows = read_rows(path.name, table, _SCHEMAS[path.name])
     if path.name in (MAP, LANES) and "scenario_id" not in rows and "map_id" not in rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")

@@ -20,7 +20,7 @@ from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
-from rlftsim.errors import ConfigError, DataError, check_types, in_short
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_path, write_atomically
 
 LEVEL = 1
@@ -48,12 +48,6 @@ class PackedShard:
     """Bytes of the tar entry."""
     raw_crc: int
     """CRC-32 of the tar entry."""
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        for name, number in vars(self).items():
-            if name != "file" and not 0 <= number < 1 << 48:
-                raise ConfigError(f"{name} of a packed shard is a number of bytes or a CRC-32, got {in_short(number)}.")
 
 
 def pack_shard(source: Path, name: str, destination: Path) -> PackedShard:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.folder import find_differences, write_identity
@@ -186,9 +186,12 @@ class Job:
         """A finished shard, whose file may be in the archive already; None before that."""
         try:
             shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
+            check_types(shard)
         except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
-        return shard if shard.file == self.shard_path(number).name else None
+        sizes, sums = (shard.size, shard.raw_size), (shard.piece_crc, shard.raw_crc)
+        fits = min(*sizes, *sums) >= 0 and max(sizes) < 1 << 50 and max(sums) < 1 << 32
+        return shard if fits and shard.file == self.shard_path(number).name else None
 
 
 def prepare_job(
