@@ -4,6 +4,7 @@ import ast
 import html
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.training.config import CatkConfig, DeviceConfig, GcslConfig, PretrainConfig
+from rlftsim.training.run_folder import read_metrics
 
 NAMES = [
     *("Scenario", "load_dataset", "write_dataset"),
@@ -360,6 +362,33 @@ def test_pre_training_further_by_a_recipe_equals_the_command_line(base, home):
     assert fingerprint_policy(further) == fingerprint_policy(rs.load_policy("runs/by-command"))
     with pytest.raises(ConfigError, match="init_from and vocabulary go with a recipe as the policy"):
         rs.pretrain("runs/base", SMALL, init_from="runs/base")
+
+
+def test_a_first_try_takes_few_scenarios_and_few_updates(home, base):
+    words = ["finetune", "smart-tiny", "--model", "runs/base", "--data", SMALL, "--out", "runs/by-command"]
+    flags = "--limit 3 --max-updates 2 --finetune.batch-size 1 --finetune.num-rollouts 2 --finetune.warmup-updates 1"
+    assert main([*words, *flags.split(), "--finetune.device.accelerator", "cpu"]) == 0
+    assert "trained on 3 scenarios" in (home / "runs" / "by-command" / "model" / "README.md").read_text()
+    config = replace(rs.recipe("smart-tiny").finetune, batch_size=1, num_rollouts=2, warmup_updates=1, device=CPU)
+    training = rs.load_dataset(SMALL, "training")
+    scenarios = list(training)[:3]
+    for data, options in ((training, {"limit": 3}), (list(training), {"limit": 3}), (scenarios, {"limit": 9})):
+        rs.finetune("runs/base", data, "runs/by-call", config, max_updates=2, **options)
+    assert [len(read_metrics(home / "runs" / name)) for name in ("by-command", "by-call")] == [2, 2]
+    # the same scenarios, so the same run and the same model
+    model = fingerprint_policy(rs.load_policy("runs/by-call"))
+    assert fingerprint_policy(rs.load_policy("runs/by-command")) == model
+    with pytest.raises(ConfigError, match="limit must be a whole number of at least 1, got 0"):
+        rs.pretrain(base, training, limit=0)
+
+
+def test_a_limit_holds_for_several_processes_and_for_an_evaluation_of_the_same_scenarios(home, base):
+    training = rs.load_dataset(SMALL, "training")
+    limited = ScenarioDataset(training.folder, "training", limit=2)
+    assert limited.scenario_ids == training.scenario_ids[:2]
+    assert pickle.loads(pickle.dumps(limited)).scenario_ids == limited.scenario_ids
+    result = rs.evaluate("constant_velocity", limited, num_rollouts=2)
+    assert result.table["scenario_id"].to_pylist() == limited.scenario_ids
 
 
 def test_pre_training_from_a_recipe_makes_a_new_policy_that_is_ready(home):

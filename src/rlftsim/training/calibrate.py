@@ -52,6 +52,7 @@ class CalibrateMethod(Method[CalibrateConfig]):
 
     settings = CalibrateConfig
     title = "calibrate"
+    needs_all_updates = True
 
     def describe(self, settings: CalibrateConfig) -> str:
         """Number of features, and the reward."""

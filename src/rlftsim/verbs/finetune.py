@@ -78,6 +78,8 @@ def finetune(
     goal: Literal["concat", "indication"] | None = None,
     goal_logit_bias: Annotated[bool | None, tyro.conf.arg(metavar="/ --no-goal-logit-bias")] = None,
     processes: Processes = None,
+    limit: int | None = None,
+    max_updates: int | None = None,
     split: str = "training",
     validation_split: str | None = None,
 ) -> Policy:
@@ -117,6 +119,10 @@ def finetune(
         goal_logit_bias: With --goal: add a goal-progress bias to the token logits (ours, not the paper's). Left out:
             yes where goal conditioning is added, unchanged where the model has it.
         processes: Processes that train, in short for the method's device.processes.
+        limit: Number of training scenarios, the first ones; left out, all of them.
+        max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
+            weights of a run that never stopped: a learning rate that falls (catk, road, gcsl) falls as over all epochs
+            and is still high at an early end. Not for calibrate, which has a model at the end alone.
         split: Split of the data set to train on.
         validation_split: With rlft, catk and road: split to validate on in closed loop, see
             --finetune.validation.every. Left out: "tune", the part of "validation" that is not of the exam.
@@ -132,7 +138,7 @@ def finetune(
     """
     if isinstance(config, PretrainConfig) or find_method(config) is None:
         check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
-    training = to_scenarios(scenarios, split)
+    training = to_scenarios(scenarios, split, limit)
     settings: Any = config
     if settings is None:
         base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
@@ -151,7 +157,9 @@ def finetune(
         learner = with_conditioning(learner, conditioning, settings.seed, name=name)
     card = write_card(f"fine-tuned ({describe_method(settings)}{conditioning})", training, policy)
     learner = prepare_policy(learner, settings)
-    return train(learner, training, out, settings, held_out=held_out, card=card, device=device)
+    return train(
+        learner, training, out, settings, device=device, held_out=held_out, card=card, max_updates=max_updates
+    )
 
 
 def find_section(method: str) -> str:

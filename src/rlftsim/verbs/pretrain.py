@@ -79,6 +79,8 @@ def pretrain(
     keep_tokens: tuple[ClassName, ...] = (),
     init_from: Model | None = None,
     processes: Processes = None,
+    limit: int | None = None,
+    max_updates: int | None = None,
     split: str = "training",
     validation_split: str | None = None,
 ) -> Policy:
@@ -110,6 +112,10 @@ def pretrain(
             registered name. It brings its vocabulary (but see --vocabulary) and the settings --model.*; flags change
             those that its weights do not depend on, such as the number of neighbors. Left out: fresh weights.
         processes: Processes that train, in short for --pretrain.device.processes.
+        limit: Number of training scenarios, the first ones; left out, all of them.
+        max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
+            weights of a run that never stopped: the learning rate falls as over all epochs, and is still high at an
+            early end.
         split: Split of the data set to train on.
         validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "tune", the
             part of "validation" that is not of the exam.
@@ -124,7 +130,7 @@ def pretrain(
         NotYetError: Another run is at work in the folder.
     """
     check_config(config, "pretrain", PretrainConfig)
-    training = to_scenarios(scenarios, split)
+    training = to_scenarios(scenarios, split, limit)
     recipe, start = None, policy
     if isinstance(policy, Recipe) or (isinstance(policy, str) and policy in RECIPES.names()):
         recipe, start = policy, init_from
@@ -153,7 +159,9 @@ def pretrain(
             replaced = () if tokens is None else (tokens, keep_tokens)
             learner = like.train_further(learner, *replaced)  # pyright: ignore[reportArgumentType]
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
-    return train(learner, training, out, settings, held_out=validation, card=card, device=device)
+    return train(
+        learner, training, out, settings, device=device, held_out=validation, card=card, max_updates=max_updates
+    )
 
 
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:

@@ -52,9 +52,8 @@ def train(
     out: str | os.PathLike[str] | None,
     settings: Any,
     *,
-    held_out: Scenarios | None,
-    card: str,
     device: Any,
+    **options: Any,
 ) -> Any:
     """The policy, trained in place and ready to simulate; the pictures of its run are drawn.
 
@@ -63,19 +62,18 @@ def train(
         scenarios: Training scenarios, with their futures.
         out: Folder of the run; None = a temporary one.
         settings: Settings of the method.
-        held_out: Scenarios for validation; None = no validation.
-        card: README of the model folder.
         device: Device of the result.
+        options: Further arguments of `train_policy`, such as the scenarios for validation.
     """
     # Weights of a loaded policy are frozen; each method freezes again what it does not train.
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)
     if out is None:
         with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
-            train_policy(policy, scenarios, folder, settings, held_out=held_out, card=card)
+            train_policy(policy, scenarios, folder, settings, **options)
     else:
         with _learning_curve(Path(out)):
-            model = train_policy(policy, scenarios, out, settings, held_out=held_out, card=card)
+            model = train_policy(policy, scenarios, out, settings, **options)
         if is_first_process():
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
