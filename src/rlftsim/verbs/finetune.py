@@ -157,9 +157,7 @@ def finetune(
         learner = with_conditioning(learner, conditioning, settings.seed, name=name)
     card = write_card(f"fine-tuned ({describe_method(settings)}{conditioning})", training, policy)
     learner = prepare_policy(learner, settings)
-    return train(
-        learner, training, out, settings, device=device, held_out=held_out, card=card, max_updates=max_updates
-    )
+    return train(learner, training, out, settings, device=device, held_out=held_out, card=card, max_updates=max_updates)
 
 
 def find_section(method: str) -> str:
