@@ -32,6 +32,8 @@ from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, rea
 
 STOPPED = "stopped"
 """Number of a checkpoint that says that the run ended there by itself."""
+OnUpdate = Callable[[int, dict[str, float]], object]
+"""Called with the number of updates done and the metrics of the update; what is returned has no effect."""
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a run takes: a data set, a list, or a single scenario."""
 
@@ -45,6 +47,7 @@ def train_policy(
     held_out: TrainingScenarios | None = None,
     card: str = "",
     max_updates: int | None = None,
+    on_update: OnUpdate | None = None,
 ) -> Path:
     """Train a policy in place; resumes where a run in `out` was stopped, or ended below a setting that `may_grow`.
 
@@ -58,6 +61,8 @@ def train_policy(
         card: README of the resulting model folder.
         max_updates: Updates after which the run ends early, with a model; no update depends on them, so that a larger
             number continues to the same weights. None = all that the settings ask for.
+        on_update: Function that the first process calls behind each update with the number of updates done and the
+            metrics by name. An error in the function ends the run, which goes on from the last checkpoint.
 
     Returns:
         The model folder, `out/model`.
@@ -81,7 +86,7 @@ def train_policy(
         settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
     )
     settings = replace(settings, device=replace(settings.device, processes=processes))
-    work = partial(_make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates)
+    work = partial(_make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update)
     with linked_processes(work, settings.device) as fabric:
         return work(fabric)
 
@@ -117,6 +122,7 @@ def _make_updates(
     held_out: Scenarios | None,
     card: str,
     max_updates: int | None,
+    on_update: OnUpdate | None,
     fabric: Fabric,
 ) -> Path:
     """The model of a run: all updates that are left, in this process.
@@ -149,6 +155,8 @@ def _make_updates(
                     run.keep_best(report.values)
                 is_last = ends or is_stopped()
                 run.finish_update(replace(report, note=report.note + note), is_last=is_last)
+                if on_update is not None and fabric.is_global_zero:
+                    on_update(learner.update, dict(report.values))
                 if is_last:
                     break
         return run.finish(card)
