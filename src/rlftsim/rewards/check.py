@@ -70,22 +70,23 @@ class RewardRules:
     def nothing_is_changed(self) -> str:
         """Rollouts and scenarios are the same after a call, as other terms read them, too."""
         tensors = (self._rollouts.position, self._rollouts.heading, self._batch.position, self._batch.heading)
-        copies = [tensor.clone() for tensor in tensors if self._computed]
-        self._compute(self._rewards, self._batch, self._rollouts)
+        copies = [tensor.clone() for tensor in tensors]
+        if self._computed:
+            self._compute(self._rewards, self._batch, self._rollouts)
         if not all(map(torch.equal, tensors, copies)):
             raise RuleBroken("positions or headings are changed in place: clone() before")
         return "positions and headings stay"
 
     def padding_changes_no_number(self) -> str:
         """A scenario alone earns what it earns in a batch with a larger one."""
-        batch, gaps = self._batch, []
+        batch, expected, gaps = self._batch, self._computed, []
         if len(set(batch.agent_mask.sum(-1).tolist())) < 2:
             raise RuleNotApplicable("no scenario is padded: hand over scenarios with different numbers of agents")
         for row, scenario in enumerate(batch.scenarios):
             alone = collate([scenario]).to(batch.device)
             rollouts = self._rollouts.select_scenario(row, alone.agent_mask.shape[1])
             values = self._compute(self._rewards, alone, rollouts)
-            gaps += [compute_gap(value[0], computed[row]) for value, computed in zip(values, self._computed)]
+            gaps += [compute_gap(value[0], computed[row]) for value, computed in zip(values, expected)]
         try:
             return self._check_gap(max(gaps))
         except RuleBroken as error:
