@@ -14,69 +14,17 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnvWrapper
-from torch import Tensor
 
 from rlftsim.envs import EgoEnv
-from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD
 from rlftsim.envs.drive_scenario import run_planner
+from rlftsim.envs.driver_view import DriverView
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.sb3 import SB3VecEnv
 from rlftsim.evaluation.compare import compare_paired
 
-ROUTE_STEP_M = 2.0
-FAR_M = 60.0
 PARTS = ("nuplan_style", "no_at_fault_collision", "drivable_area", "making_progress", "progress", "comfort")
-
-
-class DriverView(BaseFeaturesExtractor):
-    """Steering of pure pursuit, braking that leader and red light need, headway, speed over the limit, speed, lateral
-    and longitudinal acceleration, 1: [n, 9], each clipped to 2."""
-
-    def __init__(self, space: spaces.Dict) -> None:
-        super().__init__(space, 9)
-
-    def forward(self, seen: dict[str, Tensor]) -> Tensor:
-        ego, route, neighbors, lights = (seen[name] for name in ("ego", "route", "neighbors", "lights"))
-        speed, acceleration, length, limit = ego[:, 0], ego[:, 1], ego[:, 4], ego[:, 9]
-        known = seen["route_mask"].bool()
-        last = known.sum(1).long().sub(1).clamp(min=0)
-        # pure pursuit of the route point that is reached in 0.8 s, at least 3 m ahead
-        index = torch.minimum((torch.clamp(0.8 * speed, min=3.0) / ROUTE_STEP_M).round().long(), last)
-        point = route[torch.arange(len(ego)), index, :2]
-        curvature = 2 * point[:, 1] / point.square().sum(-1).clamp(min=4.0)
-        steering = torch.where(last > 0, torch.atan(0.6 * length * curvature) / STEERING_RAD, 0.0)
-
-        line = torch.where(known[..., None], route[..., :2], torch.full_like(route[..., :2], 1e4))
-        is_red = lights[..., 2:4].sum(-1) > 0
-        ahead = along_route(neighbors[..., :2], seen["neighbors_mask"], line)
-        gap, leader = (ahead - neighbors[..., 6] / 2 - length[:, None] / 2).min(-1)
-        stop = along_route(lights[..., :2], seen["lights_mask"].bool() & is_red, line).amin(-1) - length / 2
-        gap, stop = gap.clamp(1.0, FAR_M), stop.clamp(1.0, FAR_M)
-        closing = (speed - neighbors[torch.arange(len(ego)), leader, 4]) * (gap < FAR_M)
-        limit = torch.where(limit > 0, limit, 13.0)
-        numbers = [
-            steering,
-            closing * closing.abs() / (2 * gap) / ACCELERATION_MPS2,
-            1.5 * speed / gap,
-            speed.square() / (2 * stop) / ACCELERATION_MPS2 * (stop < FAR_M),
-            (speed - limit) / 10,
-            speed / 10,
-            speed.square() * curvature.abs() / 4,
-            acceleration / 4,
-            torch.ones_like(speed),
-        ]
-        return torch.stack(numbers, -1).clamp(-2, 2)
-
-
-def along_route(points: Tensor, mask: Tensor, line: Tensor) -> Tensor:
-    """Distance along the route (m) to points ahead that lie within 2 m of it; 1000 m for all others."""
-    nearest, place = torch.cdist(points, line).min(-1)
-    is_on_route = mask.bool() & (nearest < 2.0) & (points[..., 0] > 0)
-    return torch.where(is_on_route, ROUTE_STEP_M * place, torch.full_like(nearest, 1e3))
 
 
 class Shaped(VecEnvWrapper):

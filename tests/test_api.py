@@ -4,6 +4,7 @@ import ast
 import html
 import importlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -32,13 +33,14 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.training.config import CatkConfig, DeviceConfig, GcslConfig, PretrainConfig
+from rlftsim.training.run_folder import read_metrics
 
 NAMES = [
     *("Scenario", "load_dataset", "write_dataset"),
     *("Policy", "SmartPolicy", "ConstantVelocity", "load_policy", "check_policy"),
     *("simulate", "Rollouts", "Sampling", "Goals"),
     *("score", "RealismResult"),
-    *("register_reward", "leave_one_out"),
+    *("register_reward", "leave_one_out", "masked_mean", "check_reward"),
     *("recipe", "pretrain", "finetune", "FinetuneConfig"),
     *("evaluate", "Evaluation", "compare"),
     *("show", "open_studio"),
@@ -124,9 +126,9 @@ def few_updates(**changes):
 # ---- names --------------------------------------------------------------------------------------------------------
 
 
-def test_the_public_names_are_these_26_and_sorted():
+def test_the_public_names_are_these_28_and_sorted():
     assert sorted(NAMES) == rs.__all__
-    assert len(rs.__all__) == 26
+    assert len(rs.__all__) == 28
 
 
 def test_every_public_name_can_be_loaded_and_nothing_else_is_public():
@@ -360,6 +362,70 @@ def test_pre_training_further_by_a_recipe_equals_the_command_line(base, home):
     assert fingerprint_policy(further) == fingerprint_policy(rs.load_policy("runs/by-command"))
     with pytest.raises(ConfigError, match="init_from and vocabulary go with a recipe as the policy"):
         rs.pretrain("runs/base", SMALL, init_from="runs/base")
+
+
+def test_a_first_try_takes_few_scenarios_and_few_updates(home, base):
+    words = ["finetune", "smart-tiny", "--model", "runs/base", "--data", SMALL, "--out", "runs/by-command"]
+    flags = "--limit 3 --max-updates 2 --finetune.batch-size 1 --finetune.num-rollouts 2 --finetune.warmup-updates 1"
+    assert main([*words, *flags.split(), "--finetune.device.accelerator", "cpu"]) == 0
+    assert "trained on 3 scenarios" in (home / "runs" / "by-command" / "model" / "README.md").read_text()
+    config = replace(rs.recipe("smart-tiny").finetune, batch_size=1, num_rollouts=2, warmup_updates=1, device=CPU)
+    training = rs.load_dataset(SMALL, "training")
+    scenarios = list(training)[:3]
+    for data, options in ((training, {"limit": 3}), (list(training), {"limit": 3}), (scenarios, {"limit": 9})):
+        rs.finetune("runs/base", data, "runs/by-call", config, max_updates=2, **options)
+    assert [len(read_metrics(home / "runs" / name)) for name in ("by-command", "by-call")] == [2, 2]
+    # the same scenarios, so the same run and the same model
+    model = fingerprint_policy(rs.load_policy("runs/by-call"))
+    assert fingerprint_policy(rs.load_policy("runs/by-command")) == model
+    with pytest.raises(ConfigError, match="limit must be a whole number of at least 1, got 0"):
+        rs.pretrain(base, training, limit=0)
+
+
+def test_a_function_is_called_behind_each_update_and_may_end_the_run(base, home):
+    training, calls = rs.load_dataset(SMALL, "training"), []
+    config = few_updates(epochs=1.0, batch_size=1, checkpoint_every=1)
+
+    def prune(update, values):
+        calls.append((update, values["rmm"]))
+        if len(calls) == 2:
+            raise LookupError("pruned")
+
+    with pytest.raises(LookupError, match="pruned"):
+        rs.finetune(base, training, "runs/pruned", config, limit=4, on_update=prune)
+    tuned = rs.finetune(base, training, "runs/pruned", config, limit=4, on_update=prune)
+    logged = [(line["update"], line["rmm"]) for line in read_metrics(home / "runs" / "pruned")]
+    assert calls == logged
+    assert [update for update, _ in calls] == [1, 2, 3, 4]
+    whole = rs.finetune(base, training, config=replace(config, device=replace(CPU, processes=2)), limit=4)
+    assert fingerprint_policy(tuned) != fingerprint_policy(base) != fingerprint_policy(whole)
+
+
+def test_several_seeds_have_a_run_each_and_a_mean(home, capsys):
+    words = ["finetune", "smart-tiny", "--model", "runs/base", "--data", SMALL, "--out", "runs/seeds", "--seeds", "2"]
+    flags = "--limit 2 --max-updates 1 --finetune.batch-size 1 --finetune.num-rollouts 2 --finetune.warmup-updates 1"
+    assert main([*words, *flags.split(), "--finetune.device.accelerator", "cpu"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "mean over seeds" in printed
+    config = replace(rs.recipe("smart-tiny").finetune, batch_size=1, num_rollouts=2, warmup_updates=1, device=CPU)
+    for seed in range(2):
+        alone = rs.finetune("runs/base", SMALL, config=config, seed=seed, limit=2, max_updates=1)
+        assert fingerprint_policy(rs.load_policy(f"runs/seeds/seed-{seed}")) == fingerprint_policy(alone)
+    models = [rs.pretrain(TINY, SMALL, f"runs/{name}", seeds=2, max_updates=1) for name in ("fresh", "fresh")]
+    assert fingerprint_policy(models[0]) == fingerprint_policy(models[1])  # the same command does nothing more
+    weights = [fingerprint_policy(rs.load_policy(f"runs/fresh/seed-{seed}")) for seed in range(2)]
+    assert weights[0] == fingerprint_policy(models[0]) != weights[1]
+    with pytest.raises(ConfigError, match="seeds=2: several runs need a folder for theirs"):
+        rs.finetune("runs/base", SMALL, seeds=2)
+
+
+def test_a_limit_holds_for_several_processes_and_for_an_evaluation_of_the_same_scenarios(home, base):
+    training = rs.load_dataset(SMALL, "training")
+    limited = ScenarioDataset(training.folder, "training", limit=2)
+    assert limited.scenario_ids == training.scenario_ids[:2]
+    assert pickle.loads(pickle.dumps(limited)).scenario_ids == limited.scenario_ids
+    result = rs.evaluate("constant_velocity", limited, num_rollouts=2)
+    assert result.table["scenario_id"].to_pylist() == limited.scenario_ids
 
 
 def test_pre_training_from_a_recipe_makes_a_new_policy_that_is_ready(home):

@@ -60,6 +60,9 @@ OF_EVERYTHING = replace(
 )
 """The same with a sum of rewards, credit by agent, scenarios in pieces and alarms that look early."""
 
+SETTINGS = {"pretrain": PRETRAIN, "catk": CATK, "road": ROAD, "finetune": FINETUNE, "everything": OF_EVERYTHING}
+"""Settings by stage."""
+
 
 def pack_scenarios(count=NUM_SCENARIOS):
     """Small scenarios of the embedded pack that have vehicles, pedestrians and cyclists."""
@@ -92,13 +95,7 @@ def gradients_of(policy):
 
 def train(stage, policy, scenarios, out, held_out=None, **changes):
     """Run a stage with other values for some of its fields."""
-    if stage == "pretrain":
-        return train_policy(policy, scenarios, out, replace(PRETRAIN, **changes), held_out=held_out)
-    if stage in ("catk", "road"):
-        config = CATK if stage == "catk" else ROAD
-        return train_policy(policy, scenarios, out, replace(config, **changes), held_out=held_out)
-    config = OF_EVERYTHING if stage == "everything" else FINETUNE
-    return train_policy(policy, scenarios, out, replace(config, **changes), held_out=held_out)
+    return train_policy(policy, scenarios, out, replace(SETTINGS[stage], **changes), held_out=held_out)
 
 
 def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=None):

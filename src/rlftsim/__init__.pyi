@@ -6,6 +6,7 @@ from rlftsim.goals.types import Goals as Goals
 from rlftsim.policies.smart.policy import SmartPolicy as SmartPolicy
 from rlftsim.realism import RealismResult as RealismResult
 from rlftsim.rewards import leave_one_out as leave_one_out
+from rlftsim.rewards import masked_mean as masked_mean
 from rlftsim.rewards import register_reward as register_reward
 from rlftsim.rollout.baselines import ConstantVelocity as ConstantVelocity
 from rlftsim.rollout.policy import Policy as Policy
@@ -16,6 +17,7 @@ from rlftsim.scenario.types import Scenario as Scenario
 from rlftsim.studio.notebook import open_studio as open_studio
 from rlftsim.training.config import FinetuneConfig as FinetuneConfig
 from rlftsim.verbs.check_policy import check_policy as check_policy
+from rlftsim.verbs.check_reward import check_reward as check_reward
 from rlftsim.verbs.compare import compare as compare
 from rlftsim.verbs.evaluate import evaluate as evaluate
 from rlftsim.verbs.finetune import finetune as finetune

@@ -3,6 +3,7 @@
 import math
 import operator
 import os
+import re
 import traceback
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -45,6 +46,12 @@ class CheckpointError(RlftsimError):
     """A checkpoint or run folder that is damaged or does not fit; the message names the key or file and what to do."""
 
 
+class PackageError(RlftsimError):
+    """An error in code of another package, such as a reward; the message names the package, the error and the line."""
+
+    exit_status = 1
+
+
 MAX_VALUE, MAX_MESSAGE = 100, 800
 """Characters of a value in a message, and of a message."""
 
@@ -84,6 +91,30 @@ def locate_error(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     frame = [frame for frame in frames if not any(folder in frame.filename for folder in foreign)][-1]
     return f"{os.path.basename(frame.filename)}:{frame.lineno} in {frame.name}"
+
+
+def find_package_error(error: BaseException) -> PackageError | None:
+    """An error in other words, where code raised it of an installed package that extends this one; else None."""
+    from importlib.metadata import distributions  # not at the top: it takes longer than all else that is imported here
+
+    packages = {
+        re.split(r"[.:]", entry.value)[0]: distribution
+        for distribution in distributions()
+        for entry in distribution.entry_points
+        if entry.group.startswith("rlftsim.")
+    }
+    frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    roots = [name.partition(".")[0] for name in reversed(frames)]
+    # a wrong shape is noticed inside torch: the innermost line counts that is of this package or of one that extends it
+    innermost = next((root for root in roots if root == "rlftsim" or root in packages), "rlftsim")
+    if innermost == "rlftsim":
+        return None
+    package = packages[innermost]
+    cause = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return PackageError(
+        f"package {package.name} {package.version} fails ({cause}, {locate_error(error)}): repair it; --debug shows "
+        "more."
+    )
 
 
 def whole_number(name: str, value: object, least: int | None = None) -> int:

@@ -16,10 +16,13 @@ from safetensors.torch import load_file
 
 import rlftsim
 import tiny
+from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.interruption import Interruption, signals_like_ctrl_c
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training import reward as finetune_module
+from rlftsim.training.config import CalibrateConfig
 from rlftsim.training.parallel import scenario_costs
+from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 MODULES = {
@@ -246,3 +249,34 @@ def test_torchrun_finds_the_gradient_of_one_process(stage, tmp_path):
     train_in_processes(stage, tmp_path / "2", 1, "--micro-batch-cost", budget, launcher=torchrun)
     assert_same_gradients(tmp_path / "1", tmp_path / "2")
     assert (tmp_path / "2" / "model" / "model.safetensors").exists()
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "road", "finetune"])
+def test_a_run_cut_short_has_a_model_and_goes_on_to_the_weights_of_a_whole_run(
+    stage, vocabulary, drawn_scenarios, tmp_path, capsys
+):
+    def train(out, **options):
+        policy, settings = tiny.tiny_policy(vocabulary), replace(tiny.SETTINGS[stage], epochs=1.75)
+        return train_policy(policy, drawn_scenarios, tmp_path / out, settings, **options)
+
+    train("whole")
+    for cut, largest in ((3, 3), (6, 6), (20, 7)):  # 7 updates in all; RoaD's second epoch begins behind the fourth
+        model = train("cut", max_updates=cut)
+        assert len(read_metrics(tmp_path / "cut")) == largest
+        assert (model / "model.safetensors").exists()
+        if largest < 7:
+            with pytest.raises(AssertionError):
+                assert_same_weights(tmp_path / "whole", tmp_path / "cut")
+    assert f"{model} stays the model of the shorter run" in " ".join(capsys.readouterr().err.split())
+    assert_same_weights(tmp_path / "whole", tmp_path / "cut")
+    with pytest.raises(CheckpointError, match="behind update 7, this one has 2 updates: raise epochs or max_updates"):
+        train("cut", max_updates=2)
+
+
+def test_a_number_of_updates_that_makes_no_model_is_refused(vocabulary, drawn_scenarios, tmp_path):
+    policy = tiny.tiny_policy(vocabulary)
+    with pytest.raises(ConfigError, match="max_updates must be a whole number of at least 1, got 0"):
+        train_policy(policy, drawn_scenarios, tmp_path, tiny.PRETRAIN, max_updates=0)
+    with pytest.raises(ConfigError, match="max_updates=2 would leave no model: calibrate has one after all updates"):
+        train_policy(policy, drawn_scenarios, tmp_path, CalibrateConfig(), max_updates=2)
+    assert not list(tmp_path.iterdir())

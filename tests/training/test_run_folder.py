@@ -1,12 +1,19 @@
+import io
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+from torch.utils.tensorboard import SummaryWriter
 
 import tiny
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.rollout.edge_scenes import move_scenario
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.training.board import write_film
 from rlftsim.training.config import FinetuneConfig, KlConfig
 from rlftsim.training.run_folder import RunFolder, board_tag, describe_inputs, read_metrics, to_plain
 
@@ -144,3 +151,19 @@ def test_precision_is_part_of_a_run_and_threads_are_not(tmp_path):
 )
 def test_tensorboard_shows_what_belongs_together_under_one_head(name, tag):
     assert board_tag(name) == tag
+
+
+def test_tensorboard_shows_settings_to_compare_runs_by_and_plays_a_film(tmp_path):
+    folder = RunFolder(tmp_path, tiny.FINETUNE)
+    folder.continue_from(0)
+    folder.close()
+    with SummaryWriter(str(tmp_path / "tensorboard")) as board:
+        write_film(board, [np.full((10, 20, 3), grey, np.uint8) for grey in (0, 255)], 7, 0.4)
+    events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
+    (table,) = events.Tensors("settings/text_summary")
+    assert "| kl.target | 0.01 |" in table.tensor_proto.string_val[0].decode()
+    started = HParamsPluginData.FromString(events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content)
+    assert started.session_start_info.hparams["kl.target"].number_value == 0.01
+    (film,) = events.Images("film")
+    picture = Image.open(io.BytesIO(film.encoded_image_string))
+    assert (film.step, picture.size, picture.n_frames, picture.info["duration"]) == (7, (20, 10), 2, 400)

@@ -6,7 +6,7 @@ import pytest
 
 from rlftsim.cli.main import main
 from rlftsim.errors import DataError
-from rlftsim.verbs.runs import find_differences, runs
+from rlftsim.verbs.runs import find_differences, find_seeds, runs
 
 
 def write_run(folder, settings, metrics, *, is_finished=True):
@@ -67,3 +67,18 @@ def test_a_folder_without_runs_is_refused_in_one_line(tmp_path):
         runs([str(tmp_path)])
     with pytest.raises(DataError, match="does not exist"):
         runs([str(tmp_path / "missing")])
+
+
+def test_runs_that_differ_in_the_seed_alone_have_a_mean_with_its_interval(tmp_path, capsys):
+    for seed, rmm in enumerate((0.70, 0.72, 0.74)):
+        settings = {"seed": seed, "batch_size": 4, "initial_policy": f"drawn with {seed}"}
+        write_run(tmp_path / "a" / f"seed-{seed}", settings, [{"rmm": 0.1}, {"validation_rmm": rmm}])
+    write_run(tmp_path / "a" / "seed-9", {"seed": 9, "batch_size": 8}, [{"validation_rmm": 0.1}])
+    write_run(tmp_path / "b" / "seed-0", {"seed": 0, "batch_size": 4}, [{"validation_rmm": 0.1}])
+    folders = [str(path) for path in sorted(tmp_path.glob("*/*"))]
+    (group,) = find_seeds(runs(folders))
+    assert [run.folder.name for run in group] == ["seed-0", "seed-1", "seed-2"]
+    assert main(["runs", *folders]) == 0
+    printed = capsys.readouterr().out
+    # 0.72 ± 4.303 * 0.02 / sqrt(3): Student's t of two degrees of freedom
+    assert printed.count("0.72 [0.67032, 0.76968]") == 2

@@ -13,18 +13,21 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlftsim import __version__
-from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
+from rlftsim.errors import ConfigError, RlftsimError, find_package_error, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 from rlftsim.verbs.commands import COMMANDS, VERBS
 
 JOIN = "join"
+DEBUG = "--debug"
+"""Word of any command that shows an error with its traceback, not as one line."""
 OVERVIEW = "\n".join(
     [
         f"rlftsim {__version__}: traffic agents that behave like real road users.\n",
         "usage: rlftsim VERB ...      rlftsim VERB --help explains a verb\n",
         *("\n" * verb.begins_group + f"  {name:12} {verb.summary}" for name, verb in VERBS.items()),
-        f"\n  {JOIN} VERB .. put the shares of a command together that ran on several machines (--share K/N)\n",
+        f"\n  {JOIN} VERB .. put the shares of a command together that ran on several machines (--share K/N)\n"
+        f"\n  With {DEBUG} any command shows the traceback of an error.\n",
     ]
 )
 SIGNALLED = 128
@@ -41,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     words = list(sys.argv[1:] if arguments is None else arguments)
+    shows_traceback = DEBUG in words
+    words = [word for word in words if word != DEBUG]
     if not words or words[0] in ("-h", "--help", "help"):
         print(OVERVIEW, end="")
         return 0 if words else USER_MISTAKE
@@ -51,6 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         call = parse(words)
         return call.show(call.command.function(**call.arguments))
     except RlftsimError as error:
+        if shows_traceback:
+            raise
         _print_error(str(error))
         return error.exit_status
     except KeyboardInterrupt as stop:
@@ -64,11 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # `rlftsim ... | head` has read enough
         return 0
     except Exception as error:
-        line = _in_words(error)
-        if line is None:
+        line = _in_words(error) or find_package_error(error)
+        if line is None or shows_traceback:
             # A bug of this package: its traceback is what a report needs.
             raise
-        _print_error(line)
+        _print_error(str(line))
         return 1
 
 

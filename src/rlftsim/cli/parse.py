@@ -24,8 +24,9 @@ from rlftsim.verbs.commands import COMMANDS, VERBS
 
 HELP = ("-h", "--help")
 COUNTS = (
-    "jobs", "processes", "num_rollouts", "num_scenarios", "limit", "seeds", "top_k", "nodes", "cores", "measure"
-)  # fmt: skip
+    *("jobs", "processes", "num_rollouts", "num_scenarios", "limit", "max_updates", "seeds", "top_k", "nodes", "cores"),
+    "measure",
+)
 """Arguments of verbs that are 1 or more."""
 EITHER_OR = {"--goal-logit-bias": "True", "--no-goal-logit-bias": "False"}
 """Switches that may also be left out, which is a third value. tyro has no such kind: it is handed the value."""

@@ -154,7 +154,7 @@ def write_film(config: DriveConfig, scenario_id: str, out: Path) -> Path:
     Raises:
         PlannerFailure: The planner fails in this scenario.
     """
-    records = {}
+    records, scores = {}, []
     for traffic in config.traffic:
         env = make_environment(config, traffic)
         planner, scenario = load_planner(config.planner), env.source.scenario(scenario_id)
@@ -163,6 +163,7 @@ def write_film(config: DriveConfig, scenario_id: str, out: Path) -> Path:
         first = next(results)
         shown = first if is_failure(first.scores) else next((r for r in results if is_failure(r.scores)), first)
         records[f"{config.planner} in {traffic}"] = shown.record
+        scores.append(shown.planner.nuplan_style)
     path = out / f"{scenario_id}.webp"
-    to_film(path, build_animation(records), steps_per_frame=2, dots_per_inch=70)
+    to_film(path, build_animation(records, scores), steps_per_frame=2, dots_per_inch=70)
     return path

@@ -149,7 +149,9 @@ class EgoEnv(gymnasium.Env):
             self._camera = Camera(build_animation({"planner": record}), RENDER_DOTS_PER_INCH)
         present = record.motion[None, :, -1:].astype(np.float32)  # [1, A, 1, 5]
         motion = SceneMotion(present[..., :2], present[..., 2], record.is_present[None, :, -1:])
-        return self._camera.frame([Panel("planner", motion)], 0, len(self.state.world.track) - 1)
+        score = self.result().planner.nuplan_style if self.state.ended[0] else None
+        panel = Panel("planner", motion, [record.describe_step(record.steps, score)])
+        return self._camera.frame([panel], 0, len(self.state.world.track) - 1)
 
     def snapshot(self) -> bytes:
         """The running episode as bytes, to be restored in this or any process with the same data and model."""

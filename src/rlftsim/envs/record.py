@@ -9,7 +9,7 @@ from rlftsim.envs.contact import Collision
 from rlftsim.envs.episode import Episode, EpisodeState
 from rlftsim.envs.route import Route, find_route
 from rlftsim.envs.scene import Scene
-from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +33,8 @@ class Record:
     """Route that the planner sees."""
     logged_route: Route
     """Lanes that the logged agent drove, along which progress is measured."""
+    traffic: str
+    """Driver of the other agents: name of the model, or type of traffic."""
 
     @property
     def steps(self) -> int:
@@ -48,6 +50,17 @@ class Record:
     def agent_motion(self) -> Float[np.ndarray, "T1 5"]:
         """Motion of the planner's agent."""
         return self.motion[self.agent]
+
+    def describe_step(self, step: int, score: float | None = None) -> str:
+        """Text for a picture: time, speed of the planner's agent, the traffic, and a score.
+
+        Args:
+            step: Steps after the current one of the log.
+            score: Score of the whole episode in [0, 1]; None = not known yet.
+        """
+        speed = np.hypot(*self.agent_motion[step, 3:])
+        scored = "" if score is None else f"   score {score:.2f}"
+        return f"{step * STEP_S:.1f} s   {speed:.1f} m/s\n{self.traffic}{scored}"
 
     def first(self, num_steps: int) -> "Record":
         """Record of the first steps alone."""
@@ -83,4 +96,5 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         collisions=state.collisions[row],
         route=episode.atlas.routes[row],
         logged_route=find_route(scene.scenario, agent, "logged"),
+        traffic=episode.config.model if episode.config.traffic == "policy" else episode.config.traffic,
     )

@@ -1,6 +1,6 @@
 """Results of episodes: scores, missing scores, pictures and films."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from os import PathLike
@@ -10,7 +10,7 @@ import numpy as np
 from rlftsim.envs.planner_scores import PlannerScores, missing_scores, score_planner
 from rlftsim.envs.record import Record
 from rlftsim.envs.traffic_scores import TrafficScores, score_traffic
-from rlftsim.scenario.types import HISTORY_STEPS
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS
 from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import AgentBoxes, SceneMotion, build_scene, logged_trajectories
@@ -46,13 +46,13 @@ class Result:
         return missing_scores(self.record)
 
     def film(self, path: str | PathLike[str], *, title: str = "planner") -> None:
-        """Write a film, .mp4 or .webp.
+        """Write a film with time, speed, traffic and score, .mp4 or .webp.
 
         Args:
             path: File to write; the ending .mp4 or .webp decides the format.
             title: Title above the picture, such as the planner's name.
         """
-        to_film(path, build_animation({title: self.record}))
+        to_film(path, build_animation({title: self.record}, [self.planner.nuplan_style]))
 
     def __repr__(self) -> str:
         scores = self.planner
@@ -80,15 +80,21 @@ def to_scene_motion(record: Record, agents: AgentBoxes) -> SceneMotion:
     return motion.with_overlaps(agents, z[None], record.scene.size[:, 2])
 
 
-def build_animation(records: Mapping[str, Record]) -> Animation:
+def build_animation(records: Mapping[str, Record], scores: Sequence[float] | None = None) -> Animation:
     """Records of one scenario side by side, by title; agents that overlap are marked.
 
     Args:
         records: Title to record, at least one, all of the same scenario.
+        scores: Score of each record in [0, 1], which films show with time, speed and traffic; None = no such text.
     """
     scenario = next(iter(records.values())).scene.scenario
     scene = build_scene(scenario)
-    panels = [Panel(title, to_scene_motion(record, scene.agents)) for title, record in records.items()]
+    panels = []
+    for index, (title, record) in enumerate(records.items()):
+        notes = [""] * CURRENT_STEP
+        if scores is not None:
+            notes += [record.describe_step(step, scores[index]) for step in range(record.steps + 1)]
+        panels.append(Panel(title, to_scene_motion(record, scene.agents), notes if scores is not None else ()))
     return Animation(f"scenario {scenario.scenario_id}", scene, panels)
 
 

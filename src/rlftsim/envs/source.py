@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -66,7 +67,7 @@ class Source:
             raise ConfigError(
                 "policy is in training mode, in which dropout makes traffic of one seed differ: call policy.eval()."
             )
-        self.config = config
+        self.config = config if policy is None else replace(config, model=type(policy).__name__)
         self.scenarios: Scenarios = to_scenarios(scenarios if scenarios is not None else config.data, config.split)
         self.scenario_ids = list(list_scenario_ids(self.scenarios))
         self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}

@@ -5,12 +5,22 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.policies.calibrated.policy import CALIBRATION, read_calibration
+from rlftsim.rollout.policy import Policy, get_device
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
+from rlftsim.training.board import write_film
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.viewer.chart import Chart, Curve
 from rlftsim.viewer.figure import Interval, charts_to_png, draw_intervals, save_figure
+from rlftsim.viewer.film import Camera
+from rlftsim.viewer.page import Animation, Panel
+from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
 
 Lines = Sequence[Mapping[str, Any]]
 """Values of each update, see `read_metrics`."""
+FILM_STEPS, FILM_DOTS_PER_INCH = 4, 80
+"""Steps of 0.1 s between frames, and resolution: a film of some 500 kB in a second."""
 UNDRAWN_METRICS = ("update", "time", "seconds", "predictions", "learning_rate", "gradient_norm")
 """Metrics of every imitation that say nothing about its objective."""
 
@@ -31,6 +41,28 @@ def write_learning_curve(run: Path) -> Path | None:
         charts = finetuning_charts(lines) if "rmm" in lines[0] else imitation_charts(lines)
     charts_to_png(run / "learning_curve.png", charts)
     return run / "learning_curve.png"
+
+
+def film_model(run: Path, policy: Policy, scenario: Scenario) -> None:
+    """Add a film to the run's TensorBoard: a scenario as logged, and simulated by the trained policy.
+
+    Args:
+        run: Folder of a run that has ended.
+        policy: Trained policy of the run.
+        scenario: Scenario with its logged future, best a held-out one.
+    """
+    from torch.utils.tensorboard import SummaryWriter  # not at the top: `--help` has no use for it
+
+    rollouts = simulate(policy, collate([scenario]).to(get_device(policy)), num_rollouts=1, seed=0)
+    scene = build_scene(scenario)
+    motions = {"logged": logged_trajectories(scenario), "simulated": rollout_trajectories(scenario, rollouts, row=0)}
+    panels = [Panel(title, motion.with_overlaps(scene.agents)) for title, motion in motions.items()]
+    camera = Camera(Animation(f"Scenario {scenario.scenario_id}", scene, panels), FILM_DOTS_PER_INCH)
+    num_steps = min(motion.num_steps for motion in motions.values())
+    frames = [camera.frame(panels, step) for step in range(CURRENT_STEP, num_steps, FILM_STEPS)]
+    lines = read_metrics(run)
+    with SummaryWriter(str(run / "tensorboard")) as board:
+        write_film(board, frames, int(lines[-1]["update"]) if lines else 0, FILM_STEPS * STEP_S)
 
 
 def imitation_charts(lines: Lines) -> list[Chart]:

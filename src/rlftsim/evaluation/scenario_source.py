@@ -32,10 +32,10 @@ def open_held_out(
     Raises:
         DataError: No such data set.
     """
-    if isinstance(data, ScenarioDataset):
-        config = replace(config, split=data.split)
-    folder = data.folder if isinstance(data, ScenarioDataset) else dataset_folder(data)
-    return ScenarioDataset(folder, config.split, cache_size=_CACHED_SCENARIOS), config
+    if not isinstance(data, ScenarioDataset):
+        return ScenarioDataset(dataset_folder(data), config.split, cache_size=_CACHED_SCENARIOS), config
+    config = replace(config, split=data.split)
+    return ScenarioDataset(data.folder, data.split, cache_size=_CACHED_SCENARIOS, limit=data.limit), config
 
 
 def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> list[str]:

@@ -27,7 +27,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Literal
 
-from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.errors import ConfigError, DataError, RlftsimError, find_package_error
 from rlftsim.jobs.files import append_text, errors_name
 from rlftsim.jobs.interruption import ctrl_c_blocked
 from rlftsim.jobs.progress import log
@@ -260,6 +260,7 @@ class _Worker:
 def portable_error(error: Exception) -> Exception:
     """The error that is being handled, in a form that other processes can read; a bug has the traceback as a note."""
     if not isinstance(error, RlftsimError):
+        error = find_package_error(error) or error
         error.add_note(traceback.format_exc())
     try:
         pickle.loads(pickle.dumps(error))  # some errors can be pickled and not be read back

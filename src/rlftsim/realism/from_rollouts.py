@@ -4,6 +4,9 @@ import torch
 
 from rlftsim.errors import DataError
 from rlftsim.realism.agents import SimulatedStates
+from rlftsim.realism.config import metric_by_name
+from rlftsim.realism.credit import AgentScores
+from rlftsim.realism.meta_metric import RealismResult, compute_batch_features, score_batch_features
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, Scenario
@@ -25,6 +28,21 @@ def states_of_rollouts(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[Simula
         ids = scenario.tracks.object_id[scenario.simulated_indices]
         states.append(SimulatedStates(ids, position[..., 0], position[..., 1], z, heading))
     return tuple(states)
+
+
+def score_rollouts(batch: ScenarioBatch, rollouts: Rollouts, metric: str) -> tuple[RealismResult, AgentScores]:
+    """Realism of rollouts, and its split over agents; a scenario without a map counts as on the road.
+
+    The features behind both are measured once; shares of agents are computed on first use.
+
+    Args:
+        batch: Scenarios with futures.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
+        metric: Name of the meta-metric's configuration.
+    """
+    config = metric_by_name(metric)
+    features = compute_batch_features(batch.scenarios, states_of_rollouts(batch, rollouts), missing_map="neutral")
+    return score_batch_features(features, config), AgentScores(features, config, batch.agent_mask.shape[1])
 
 
 def logged_states(scenario: Scenario, *, num_rollouts: int, device: torch.device | str = "cpu") -> SimulatedStates:

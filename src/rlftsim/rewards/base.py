@@ -23,7 +23,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
@@ -178,6 +179,17 @@ def leave_one_out(values: Float[Tensor, "B N *A"]) -> Float[Tensor, "B N *A"]:
     num_rollouts = values.shape[1]
     # v_i - sum_{j != i} v_j / (N - 1) = (v_i - mean) N / (N - 1)
     return (values - values.mean(1, keepdim=True)) * (num_rollouts / (num_rollouts - 1))
+
+
+def masked_mean(values: Float[Tensor, "B N A"], mask: Bool[Tensor, "B A"]) -> Float[Tensor, "B N"]:
+    """Mean over some agents of each scenario, 0 where there are none. Padding does not count, whatever its values.
+
+    Args:
+        values: Value of each agent in each rollout, such as a distance in meters.
+        mask: Agents that count, such as `batch.agent_mask`, all but padding, or `batch.evaluated_mask`.
+    """
+    mask = mask[:, None]
+    return torch.where(mask, values, 0.0).sum(-1) / mask.sum(-1).clamp(min=1)
 
 
 def check_num_rollouts(values: Float[Tensor, "B N *A"]) -> None:

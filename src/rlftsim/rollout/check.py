@@ -12,16 +12,25 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlftsim.errors import RlftsimError, locate_error
+from rlftsim.errors import RlftsimError
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout import edge_scenes
+from rlftsim.rollout.contract import (
+    CheckReport,
+    RuleBroken,
+    RuleNotApplicable,
+    check_gap,
+    check_limit,
+    check_rules,
+    check_worst,
+    compute_gap,
+)
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import (
     DecisionDistribution,
@@ -51,53 +60,6 @@ MONTE_CARLO_ERRORS = 5.0
 LEAD_TURN_RATE_RADPS = 0.2
 SHIFT_M = (137.0, -52.0)
 
-Outcome = Literal["passed", "failed", "not applicable"]
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """Outcome of one rule of the contract."""
-
-    rule: str
-    """Name of the method of `Rules`, with spaces."""
-    outcome: Outcome
-    detail: str
-    """The measurement, or the reason for which the rule does not apply."""
-
-    def __str__(self) -> str:
-        return f"{self.outcome:>14}  {self.rule}: {self.detail}"
-
-
-@dataclass(frozen=True)
-class CheckReport:
-    """Outcomes of all rules of the contract."""
-
-    policy: str
-    results: tuple[CheckResult, ...]
-
-    @property
-    def failures(self) -> tuple[CheckResult, ...]:
-        """Results of the violated rules."""
-        return tuple(r for r in self.results if r.outcome == "failed")
-
-    @property
-    def is_passed(self) -> bool:
-        """True if no rule is violated."""
-        return not self.failures
-
-    def __str__(self) -> str:
-        count = sum(r.outcome == "passed" for r in self.results)
-        summary = f"{self.policy}: {count} rules passed, {len(self.failures)} failed."
-        return "\n".join([summary, *(str(r) for r in self.results)])
-
-
-class _NotApplicable(Exception):
-    """The rule does not apply to this policy; the message has the reason."""
-
-
-class _Broken(Exception):
-    """The rule is violated; the message has the measurement."""
-
 
 def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Policy | None = None) -> CheckReport:
     """Try every rule of the policy contract that applies.
@@ -114,19 +76,7 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         A result per rule. A rule with an error in the check counts as failed, with the error as detail.
     """
     rules = Rules(_copy_for_evaluation(policy), tuple(scenarios), reference)
-    results = []
-    for check in CHECKS:
-        outcome: Outcome = "passed"
-        try:
-            detail = check(rules)
-        except _NotApplicable as error:
-            outcome, detail = "not applicable", str(error)
-        except _Broken as error:
-            outcome, detail = "failed", str(error)
-        except Exception as error:  # whatever a policy raises is an outcome of the test
-            outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({locate_error(error)})"
-        results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
-    return CheckReport(type(policy).__name__, tuple(results))
+    return check_rules(rules, type(policy).__name__)
 
 
 def _copy_for_evaluation(policy: Policy) -> Policy:
@@ -184,7 +134,7 @@ class _Subject:
     @property
     def module(self) -> nn.Module:
         if not isinstance(self.policy, nn.Module) or not any(True for _ in self.policy.parameters()):
-            raise _NotApplicable("the policy has no weights")
+            raise RuleNotApplicable("the policy has no weights")
         return self.policy
 
     def copy_module(self, is_trained: bool) -> Policy:
@@ -234,32 +184,6 @@ class _Subject:
         return torch.where(rollouts.decision_mask, scored, 0.0)
 
 
-def _check_limit(measured: float, allowed: float, title: str = "largest gap") -> str:
-    """Text of a measurement, or `_Broken` with the text."""
-    text = f"{title} {measured:.2g}, allowed {allowed:g}"
-    if not measured <= allowed:
-        raise _Broken(text)
-    return text
-
-
-def _compute_gap(a: Tensor, b: Tensor) -> float:
-    """Largest absolute difference; infinite where shapes differ or a value is not finite."""
-    if a.shape != b.shape or not (a.isfinite().all() and b.isfinite().all()):
-        return math.inf
-    return float((a.detach().double() - b.detach().double()).abs().max()) if a.numel() else 0.0
-
-
-def _check_gap(a: Tensor, b: Tensor, allowed: float, title: str = "largest gap") -> str:
-    """Text of the largest absolute difference, or `_Broken` with the text."""
-    return _check_limit(_compute_gap(a, b), allowed, title)
-
-
-def _check_worst(gaps: dict[str, float], allowed: float, title: str) -> str:
-    """Text of the largest of named gaps, or `_Broken` with the text."""
-    worst = max(gaps, key=lambda name: gaps[name])
-    return _check_limit(gaps[worst], allowed, f"{title} ({worst})")
-
-
 def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
     """A `force` along arcs: of the first agent throughout, of every third from the second on for two seconds."""
     states = (batch.position, batch.velocity, batch.heading)
@@ -302,22 +226,15 @@ def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
     )
 
 
-def _select_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
-    """Rollouts of a scenario of a batch, without padding."""
-    names = ("position", "heading", "decision", "decision_mask", "log_prob")
-    values = {name: getattr(rollouts, name)[b : b + 1, :, :num_agents] for name in names}
-    return replace(rollouts, **values, draws=None if rollouts.draws is None else rollouts.draws[b : b + 1])
-
-
 class Rules(_Subject):
     """The contract: a public method for each rule.
 
-    A rule returns the measurement as a text, or raises `_Broken` or `_NotApplicable`.
+    A rule returns the measurement as a text, or raises `RuleBroken` or `RuleNotApplicable`.
     """
 
     def _check_scores(self, rollouts: Rollouts) -> str:
-        """Text of the largest difference between scored and sampled log-probabilities, or `_Broken` with the text."""
-        return _check_gap(self.log_prob(self.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
+        """Text of the largest difference between scored and sampled log-probabilities; `RuleBroken` if too large."""
+        return check_gap(self.log_prob(self.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
 
     # ---- rules: scores ----------------------------------------------------------------------------------------------
 
@@ -330,7 +247,7 @@ class Rules(_Subject):
         rollouts = self.with_forced
         assert rollouts.forced is not None
         offset = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
-        _check_limit(float(offset.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
+        check_limit(float(offset.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
         return self._check_scores(rollouts)
 
     def scored_log_probs_equal_sampled_ones_with_goals(self) -> str:
@@ -342,7 +259,7 @@ class Rules(_Subject):
         position = torch.full_like(self.batch.position[:, :, CURRENT_STEP], math.nan)
         empty = Goals.of_scenarios(position, torch.zeros_like(self.batch.agent_mask))
         rollouts = self.simulate(self.batch, goals=empty)
-        _check_gap(rollouts.position, self.rollouts.position, 0.0, "rollouts apart (m)")
+        check_gap(rollouts.position, self.rollouts.position, 0.0, "rollouts apart (m)")
         return self._check_scores(rollouts)
 
     def scores_of_slices_equal_slices_of_scores(self) -> str:
@@ -351,15 +268,15 @@ class Rules(_Subject):
         for rollouts in (self.rollouts, self.with_forced, self.with_goals):
             scored = self.log_prob(self.batch, rollouts)
             for selected in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
-                gaps.append(_compute_gap(self.log_prob(self.batch, rollouts.select(selected)), scored[:, selected]))
-        return _check_limit(max(gaps), SCORE_TOLERANCE)
+                gaps.append(compute_gap(self.log_prob(self.batch, rollouts.select(selected)), scored[:, selected]))
+        return check_limit(max(gaps), SCORE_TOLERANCE)
 
     # ---- rules: the distribution ------------------------------------------------------------------------------------
 
     def kl_from_itself_is_zero(self) -> str:
         """The KL divergence of a policy from itself is 0."""
         scored = self.score(self.batch, self.rollouts)
-        return _check_limit(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
+        return check_limit(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
 
     def kl_from_another_policy_is_positive(self) -> str:
         """The KL divergence from a second policy is not negative, and somewhere positive."""
@@ -367,8 +284,8 @@ class Rules(_Subject):
         scored = self.score(self.batch, self.rollouts)
         kl = scored.kl(self.score(self.batch, self.rollouts, reference)).detach()
         if self.is_random and not float(kl.max()) > 0:
-            raise _Broken("the KL from another policy is 0 everywhere")
-        return _check_limit(-float(kl.min()), 1e-6, "most negative KL: minus")
+            raise RuleBroken("the KL from another policy is 0 everywhere")
+        return check_limit(-float(kl.min()), 1e-6, "most negative KL: minus")
 
     def padding_has_zero_log_prob_kl_and_entropy(self) -> str:
         """Padding has log-probability, KL and entropy of exactly 0."""
@@ -379,7 +296,7 @@ class Rules(_Subject):
         # two more agents than there are: even the largest scenario has padding
         padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
         values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
-        return _check_limit(max(float(v[padding].detach().abs().max()) for v in values), 0.0, "largest value")
+        return check_limit(max(float(v[padding].detach().abs().max()) for v in values), 0.0, "largest value")
 
     def entropy_matches_monte_carlo(self) -> str:
         """The entropy is the mean of minus the log-probability of draws."""
@@ -390,7 +307,7 @@ class Rules(_Subject):
         """The KL divergence from a second policy is the mean log-ratio of draws."""
         distribution, decisions, log_prob = self._draw_decisions()
         if not getattr(self.policy, "sampling", Sampling()).is_full:
-            raise _NotApplicable("the model excludes decisions, and the KL is over those that are left")
+            raise RuleNotApplicable("the model excludes decisions, and the KL is over those that are left")
         reference = self._decide_first(self.reference)
         # KL(p || q) is the mean of log p - log q over draws from p
         ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(log_prob, decisions)])
@@ -414,13 +331,13 @@ class Rules(_Subject):
             return policy.decide(context, policy.begin(context, num_rollouts, None, noise))
 
     def _check_means(self, draws: Tensor, expected: Tensor) -> str:
-        """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A], or `_Broken` with the text."""
+        """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A]; `RuleBroken` if too far."""
         # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
         mask = self.smallest_batch.agent_mask[0]
         flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
         error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
         gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
-        return _check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
+        return check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
 
     def _draw_decisions(self, temperature: float = 1.0) -> tuple[DecisionDistribution, list[Tensor], Tensor]:
         """Many draws of the first decision of the smallest scenario.
@@ -433,7 +350,7 @@ class Rules(_Subject):
             was drawn from.
         """
         if not self.is_random:
-            raise _NotApplicable("decisions are deterministic (noise_size is 0)")
+            raise RuleNotApplicable("decisions are deterministic (noise_size is 0)")
         distribution, sampling = self._decide_first(self.policy), Sampling(temperature=temperature)
         mask = self.smallest_batch.agent_mask[0]
         generator = torch.Generator().manual_seed(0)
@@ -451,15 +368,15 @@ class Rules(_Subject):
         first, second = (self.simulate(self.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
         if not self.policy.initial_noise_size:
             repeated = first.position[:, :1].expand_as(first.position)
-            _check_gap(first.position, repeated, POSE_TOLERANCE_M, "rollouts apart (m)")
-        return _check_gap(first.position, second.position, 0.0, "runs apart (m)")
+            check_gap(first.position, repeated, POSE_TOLERANCE_M, "rollouts apart (m)")
+        return check_gap(first.position, second.position, 0.0, "runs apart (m)")
 
     def same_seed_gives_same_rollouts(self) -> str:
         """The same seed gives the same rollouts, whole or in slices."""
         repeated = self.simulate(self.batch)
-        _check_gap(repeated.position, self.rollouts.position, 0.0, "runs apart (m)")
+        check_gap(repeated.position, self.rollouts.position, 0.0, "runs apart (m)")
         last = self.simulate(self.batch, range(1, NUM_ROLLOUTS))
-        return _check_gap(last.position, self.rollouts.position[:, 1:], POSE_TOLERANCE_M, "slices apart (m)")
+        return check_gap(last.position, self.rollouts.position[:, 1:], POSE_TOLERANCE_M, "slices apart (m)")
 
     def top_k_truncates_or_is_refused(self) -> str:
         """Top-k keeps the most likely decisions, or is refused where there are no categories."""
@@ -468,20 +385,20 @@ class Rules(_Subject):
                 self.simulate(self.batch, sampling=Sampling(top_k=3))
             except RlftsimError as error:
                 return f"refused: {error}"
-            raise _Broken("decisions are not categorical, and yet top_k=3 is accepted")
+            raise RuleBroken("decisions are not categorical, and yet top_k=3 is accepted")
         # top-1 is the mode; and log-probabilities are those of the truncated, renormalized distribution
         greedy = self.simulate(self.batch, sampling=Sampling(temperature=0.0))
         first = self.simulate(self.batch, sampling=Sampling(top_k=1))
-        _check_gap(first.position, greedy.position, POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
+        check_gap(first.position, greedy.position, POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
         truncated = self.simulate(self.batch, sampling=Sampling(top_k=3))
         scored = self.score(self.batch, truncated).log_prob(truncated.decision, Sampling(top_k=3))
         scored = torch.where(truncated.decision_mask, scored, 0.0)
-        return _check_gap(scored, truncated.log_prob, SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
+        return check_gap(scored, truncated.log_prob, SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
 
     def replayed_decisions_give_same_poses(self) -> str:
         """Replaying decisions through `advance` gives the same poses, bit for bit."""
         gaps = [self._measure_replay_gap(rollouts) for rollouts in (self.rollouts, self.with_forced)]
-        return _check_limit(max(gaps), 0.0, "largest gap (m, rad)")
+        return check_limit(max(gaps), 0.0, "largest gap (m, rad)")
 
     def _measure_replay_gap(self, rollouts: Rollouts) -> float:
         policy, stride = self.policy, self.policy.steps_per_decision
@@ -498,7 +415,7 @@ class Rules(_Subject):
                 state = policy.advance(context, state, rollouts.decision[:, :, :, index], forced)
                 poses.append(state.poses)
         path = torch.cat(poses, 3)
-        return max(_compute_gap(path[..., :2], rollouts.position), _compute_gap(path[..., 2], rollouts.heading))
+        return max(compute_gap(path[..., :2], rollouts.position), compute_gap(path[..., 2], rollouts.heading))
 
     # ---- rules: gradients -------------------------------------------------------------------------------------------
 
@@ -512,21 +429,21 @@ class Rules(_Subject):
         strays = [name for name in gradients if not weights[name].requires_grad]
         broken = [name for name, gradient in gradients.items() if not gradient.isfinite().all()]
         if missing or strays or broken:
-            raise _Broken(f"not reached: {missing}; reached though not trained: {strays}; not finite: {broken}")
+            raise RuleBroken(f"not reached: {missing}; reached though not trained: {strays}; not finite: {broken}")
         flat = [name for name, gradient in gradients.items() if not gradient.any()]
         return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
 
     def zero_reward_gives_zero_gradient(self) -> str:
         """With a reward of 0 the policy gradient is exactly 0."""
         gradients = [weight.grad for weight in self._back_propagate(scale=0.0).values() if weight.grad is not None]
-        largest = max(_compute_gap(gradient, torch.zeros_like(gradient)) for gradient in gradients)
-        return _check_limit(largest, 0.0, "largest gradient")
+        largest = max(compute_gap(gradient, torch.zeros_like(gradient)) for gradient in gradients)
+        return check_limit(largest, 0.0, "largest gradient")
 
     def _back_propagate(self, *, scale: float) -> dict[str, nn.Parameter]:
         """Weights with gradients of a policy-gradient loss, with rewards of `scale` times 1, 2, ... by rollout."""
         module = copy.deepcopy(self.module)
         if not any(weight.requires_grad for weight in module.parameters()):
-            raise _NotApplicable("no weight is trained")
+            raise RuleNotApplicable("no weight is trained")
         assert isinstance(module, Policy)
         module.zero_grad(set_to_none=True)
         rollouts = self.with_goals  # so that weights for goals take part
@@ -539,7 +456,7 @@ class Rules(_Subject):
         """Freezing the weights changes no score."""
         policies = [self.copy_module(is_trained) for is_trained in (False, True)]
         frozen, trained = (self.log_prob(self.batch, self.rollouts, policy) for policy in policies)
-        return _check_gap(frozen, trained, SCORE_TOLERANCE)
+        return check_gap(frozen, trained, SCORE_TOLERANCE)
 
     def shared_passes_change_no_number(self) -> str:
         """Passes that share features, and statistics in one pass, give the numbers of separate passes."""
@@ -555,8 +472,8 @@ class Rules(_Subject):
                     statistics = compute_statistics(dist, decision, ref)
                 kl = expected.kl(self.score(self.batch, rollouts, reference))
                 values = (expected.log_prob(decision), kl, expected.entropy())
-                gaps += map(_compute_gap, (statistics.log_prob, statistics.kl, statistics.entropy), values)
-        return _check_limit(max(gaps), SCORE_TOLERANCE)
+                gaps += map(compute_gap, (statistics.log_prob, statistics.kl, statistics.entropy), values)
+        return check_limit(max(gaps), SCORE_TOLERANCE)
 
     # ---- rules: scenarios -------------------------------------------------------------------------------------------
 
@@ -575,31 +492,31 @@ class Rules(_Subject):
             offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(get_device(self.policy))  # [B, 2]
             for rollouts in (still.rollouts, still.with_forced, still.with_goals):
                 scored = self.log_prob(batch, _move_rollouts(rollouts, turn, offset))
-                gaps[name] = max(gaps.get(name, 0.0), _compute_gap(scored, self.log_prob(still.batch, rollouts)))
-        return _check_worst(gaps, SCORE_TOLERANCE + self.rounding, "largest gap")
+                gaps[name] = max(gaps.get(name, 0.0), compute_gap(scored, self.log_prob(still.batch, rollouts)))
+        return check_worst(gaps, SCORE_TOLERANCE + self.rounding, "largest gap")
 
     def rollouts_are_independent_of_batch_composition(self) -> str:
         """A scenario alone has the same scores as in a batch with a larger scenario, and the same rollouts."""
         batch, gaps, distances = self.batch, [], []
         if len(self.scenarios) < 2:
-            raise _NotApplicable("a single scenario was handed over")
+            raise RuleNotApplicable("a single scenario was handed over")
         # a policy that draws once per rollout gets as many agents as in the batch: its draws have that shape
         scored = self.log_prob(batch, self.rollouts)
         for b, scenario in enumerate(self.scenarios):
             count = batch.agent_mask.shape[1] if self.rollouts.draws is not None else len(scenario.simulated_indices)
             single = self.collate([scenario], max_agents=count)
-            rollouts = _select_scenario(self.rollouts, b, count)
-            gaps.append(_compute_gap(self.log_prob(single, rollouts), scored[b : b + 1, :, :count]))
-            distances.append(_compute_gap(self.simulate(single).position, rollouts.position))
-        _check_limit(max(distances), POSE_TOLERANCE_M, "rollouts apart (m)")
-        return _check_limit(max(gaps), PADDING_TOLERANCE + self.rounding)
+            rollouts = self.rollouts.select_scenario(b, count)
+            gaps.append(compute_gap(self.log_prob(single, rollouts), scored[b : b + 1, :, :count]))
+            distances.append(compute_gap(self.simulate(single).position, rollouts.position))
+        check_limit(max(distances), POSE_TOLERANCE_M, "rollouts apart (m)")
+        return check_limit(max(gaps), PADDING_TOLERANCE + self.rounding)
 
     def rollouts_do_not_depend_on_the_logged_future(self) -> str:
         """The rollouts are the same where tracks and lights end at the current step, as in a test split."""
         if not all(scenario.has_future for scenario in self.scenarios):
-            raise _NotApplicable("a scenario has no logged future")
+            raise RuleNotApplicable("a scenario has no logged future")
         batch = self.collate([edge_scenes.without_future(scenario) for scenario in self.scenarios])
-        return _check_gap(self.simulate(batch).position, self.rollouts.position, POSE_TOLERANCE_M, "apart (m)")
+        return check_gap(self.simulate(batch).position, self.rollouts.position, POSE_TOLERANCE_M, "apart (m)")
 
     def edge_cases_can_be_simulated_and_scored(self) -> str:
         """Simulations and scores succeed: one agent, 128, no map, no lights, agents first seen now or never, NaN."""
@@ -608,9 +525,6 @@ class Rules(_Subject):
             batch = self.collate([scenario])
             rollouts = self.simulate(batch)
             if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):
-                raise _Broken(f"{name}: poses are not finite")
-            gaps[name] = _compute_gap(self.log_prob(batch, rollouts), rollouts.log_prob)
-        return _check_worst(gaps, SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap")
-
-
-CHECKS = tuple(rule for name, rule in vars(Rules).items() if not name.startswith("_"))
+                raise RuleBroken(f"{name}: poses are not finite")
+            gaps[name] = compute_gap(self.log_prob(batch, rollouts), rollouts.log_prob)
+        return check_worst(gaps, SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap")

@@ -140,6 +140,22 @@ class Rollouts:
             forced=None if self.forced is None else self.forced.rollouts(selected),
         )
 
+    def select_scenario(self, row: int, num_agents: int) -> "Rollouts":
+        """Rollouts of one scenario, a batch of its own; without the steps that were forced.
+
+        Args:
+            row: Index of the scenario on axis B.
+            num_agents: Agents to keep, the first ones, such as all but padding.
+        """
+        names = ("position", "heading", "decision", "decision_mask", "log_prob")
+        values = {name: getattr(self, name)[row : row + 1, :, :num_agents] for name in names}
+        goals = self.goals
+        if goals is not None:
+            position, mask = (tensor[row : row + 1, :, :num_agents] for tensor in (goals.position, goals.goal_mask))
+            goals = replace(goals, position=position, goal_mask=mask)
+        draws = None if self.draws is None else self.draws[row : row + 1]
+        return replace(self, **values, draws=draws, goals=goals, forced=None)
+
     # ---- agents by object id: rollouts that `rlftsim.simulate` returned ------------------------------------------
 
     def find_row(self, scenario_id: str | None = None) -> int:

@@ -118,14 +118,23 @@ class ScenarioDataset:
         split: Split of the scenarios, e.g. "training"; None = all splits. "tune" and "exam" are drawn from validation
             if not stored, see the module.
         cache_size: Number of decoded scenarios in memory, about 1 MB each; the least recently used go first.
+        limit: Number of scenarios, the first ones of the split; None = all.
 
     Raises:
         DataError: No data set in the folder, an unfinished or damaged data set, or no such split.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], split: str | None = None, *, cache_size: int = 256) -> None:
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        split: str | None = None,
+        *,
+        cache_size: int = 256,
+        limit: int | None = None,
+    ) -> None:
         self.folder = dataset_folder(folder)
         self.split = split
+        self.limit = limit
         origin = self.folder / ORIGIN
         self.url = origin.read_text(encoding="utf-8") if origin.exists() else None
         """Address of a remote data set, of which the folder holds index and manifest."""
@@ -144,6 +153,8 @@ class ScenarioDataset:
                     "by load_dataset(name, split)"
                 )
             self.index = index.filter(pa.array(is_in_split))
+        if limit is not None:
+            self.index = self.index.slice(0, limit)
         """Table with the columns of `INDEX_SCHEMA`, a row per scenario, in the order of positions."""
         self.scenario_ids: list[str] = self.index["scenario_id"].to_pylist()
         self._shard_names: list[str] = self.index["shard"].to_pylist()
@@ -230,7 +241,8 @@ class ScenarioDataset:
 
     def __reduce__(self) -> tuple[Callable[..., "ScenarioDataset"], tuple[object, ...]]:
         # memory maps, locks and caches stay in their process
-        return partial(ScenarioDataset, cache_size=self.cache_size), (self.url or self.folder, self.split)
+        options = {"cache_size": self.cache_size, "limit": self.limit}
+        return partial(ScenarioDataset, **options), (self.url or self.folder, self.split)
 
     def __repr__(self) -> str:
         split = "" if self.split is None else f", split {self.split!r}"

@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
-from rlftsim.errors import ConfigError, DataError, in_short
+from rlftsim.errors import ConfigError, DataError, in_short, whole_number
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.shards import check_scenario
@@ -70,15 +70,16 @@ AnyScenarios: TypeAlias = Scenario | ScenarioBatch | Scenarios | Name
 training to train, validation else, as on the command line."""
 
 
-def to_scenarios(scenarios: Any, split: str | None = "validation") -> Scenarios:
+def to_scenarios(scenarios: Any, split: str | None = "validation", limit: int | None = None) -> Scenarios:
     """Scenarios by position, in whatever form they were handed over.
 
     Args:
         scenarios: Scenario, list of scenarios, batch, data set, or the name of a data set.
         split: Split that is opened of a data set handed over by name; None = all splits.
+        limit: Number of scenarios, the first ones; None = all.
 
     Raises:
-        ConfigError: No scenario, or a value of another type was handed over.
+        ConfigError: No scenario, no positive limit, or a value of another type was handed over.
         DataError: No data set of this name, or without this split, or a scenario made in Python is unsound.
     """
     # A string has a length and items too, so names are looked at first.
@@ -91,6 +92,12 @@ def to_scenarios(scenarios: Any, split: str | None = "validation") -> Scenarios:
     remedy = "hand over one, a list of them, a batch or a data set."
     if not isinstance(sequence, Scenarios) or isinstance(sequence, Mapping):
         raise ConfigError(f"{in_short(scenarios)}: not scenarios: {remedy}")
+    if limit is not None:
+        limit = min(whole_number("limit", limit, 1), len(sequence))
+        if isinstance(sequence, ScenarioDataset):
+            sequence = ScenarioDataset(sequence.folder, sequence.split, cache_size=sequence.cache_size, limit=limit)
+        else:
+            sequence = [sequence[position] for position in range(limit)]
     # Scenarios of a data set were checked when they were written.
     for position in range(0 if isinstance(sequence, ScenarioDataset) else len(sequence)):
         scenario = sequence[position]

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
 from rlftsim.realism import AgentScores, RealismResult
+from rlftsim.realism.from_rollouts import score_rollouts
 from rlftsim.rewards import compute_rewards, leave_one_out, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
@@ -34,7 +35,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.config import CalibrateConfig
 from rlftsim.training.data import batch_with_futures
-from rlftsim.training.experience import mean_speeds, score_rollouts
+from rlftsim.training.experience import mean_speeds
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 
@@ -52,6 +53,7 @@ class CalibrateMethod(Method[CalibrateConfig]):
 
     settings = CalibrateConfig
     title = "calibrate"
+    needs_all_updates = True
 
     def describe(self, settings: CalibrateConfig) -> str:
         """Number of features, and the reward."""

@@ -154,4 +154,5 @@ def share_cache(scenarios: Scenarios, num_processes: int) -> Scenarios:
         return scenarios
     if len(scenarios) * num_processes <= scenarios.cache_size:
         return scenarios
-    return ScenarioDataset(scenarios.folder, scenarios.split, cache_size=max(scenarios.cache_size // num_processes, 1))
+    cache_size = max(scenarios.cache_size // num_processes, 1)
+    return ScenarioDataset(scenarios.folder, scenarios.split, cache_size=cache_size, limit=scenarios.limit)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from rlftsim.goals.attainment import is_passed, is_reached, rate
 from rlftsim.jobs.threads import one_thread
-from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
-from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.realism import RealismResult
+from rlftsim.realism.from_rollouts import score_rollouts
 from rlftsim.rewards import Rewards, Term, compute_rewards, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
@@ -98,21 +98,6 @@ def _gather_rollouts(rollouts: Rollouts, num_rollouts: int, fabric: Fabric) -> R
     joined: dict[str, Any] = {name: torch.cat([tensors[name] for tensors in groups], 1) for name in names}
     goals = rollouts.goals and rollouts.goals.rollouts(slice(1)).repeat(num_rollouts)
     return replace(rollouts, **joined, goals=goals)
-
-
-def score_rollouts(batch: ScenarioBatch, rollouts: Rollouts, metric: str) -> tuple[RealismResult, AgentScores]:
-    """Realism of rollouts, and its split over agents; a scenario without a map counts as on the road.
-
-    The features behind both are measured once; shares of agents are computed on first use.
-
-    Args:
-        batch: Scenarios with futures.
-        rollouts: N rollouts of each scenario, in the frame of the batch.
-        metric: Name of the meta-metric's configuration.
-    """
-    config = metric_by_name(metric)
-    features = compute_batch_features(batch.scenarios, states_of_rollouts(batch, rollouts), missing_map="neutral")
-    return score_batch_features(features, config), AgentScores(features, config, batch.agent_mask.shape[1])
 
 
 def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:

@@ -218,7 +218,7 @@ class UpdateScenarios:
 
 @runtime_checkable
 class Method(Protocol[Settings]):
-    """A way to train a policy. A subclass inherits `describe` and `validates`."""
+    """A way to train a policy. A subclass inherits all that has a value here."""
 
     settings: type[Settings]
     """Dataclass of the method's settings, all with defaults. The type of the settings says which method trains."""
@@ -226,6 +226,8 @@ class Method(Protocol[Settings]):
     """Label of the progress bar and name of the method in messages."""
     validates: bool = False
     """True = the settings have a section `validation`, and held-out scenarios may be validated on."""
+    needs_all_updates: bool = False
+    """True = there is a model after the last update alone, so that no run may end earlier."""
 
     def describe(self, settings: Settings) -> str:
         """The method in a few words, for the README of trained models."""

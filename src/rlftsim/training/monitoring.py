@@ -25,6 +25,7 @@ from torch.nn import functional
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
+from rlftsim.realism.from_rollouts import score_rollouts
 from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling, frozen_copy
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -32,7 +33,6 @@ from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary
 from rlftsim.training.config import AlarmConfig, ValidationConfig
 from rlftsim.training.data import batch_with_futures
-from rlftsim.training.experience import score_rollouts
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
+from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError, whole_number
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
@@ -32,6 +32,8 @@ from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, rea
 
 STOPPED = "stopped"
 """Number of a checkpoint that says that the run ended there by itself."""
+OnUpdate = Callable[[int, dict[str, float]], object]
+"""Called with the number of updates done and the metrics of the update; what is returned has no effect."""
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a run takes: a data set, a list, or a single scenario."""
 
@@ -44,6 +46,8 @@ def train_policy(
     *,
     held_out: TrainingScenarios | None = None,
     card: str = "",
+    max_updates: int | None = None,
+    on_update: OnUpdate | None = None,
 ) -> Path:
     """Train a policy in place; resumes where a run in `out` was stopped, or ended below a setting that `may_grow`.
 
@@ -55,27 +59,24 @@ def train_policy(
             along the log, and so on. A resumed run keeps the number of processes, which rounding depends on.
         held_out: Scenarios to validate on in closed loop, see `validation` of the settings; None = no validation.
         card: README of the resulting model folder.
+        max_updates: Updates after which the run ends early, with a model; no update depends on them, so that a larger
+            number continues to the same weights. None = all that the settings ask for.
+        on_update: Function that the first process calls behind each update with the number of updates done and the
+            metrics by name. An error in the function ends the run, which goes on from the last checkpoint.
 
     Returns:
         The model folder, `out/model`.
 
     Raises:
-        ConfigError: The method cannot train this policy or does not validate, there is no scenario, or several
-            processes cannot be started here.
+        ConfigError: The method cannot train this policy, does not validate or cannot end early, there is no scenario,
+            or several processes cannot be started here.
         DataError: A scenario lacks data that the method needs, the folder cannot be written to, or a process died.
         CheckpointError: `out` holds a different or a damaged run, or the run diverged (the last good checkpoint is
             named).
         NotYetError: A second run is at work in `out`.
         KeyboardInterrupt: Ctrl-C or a similar signal; says from where the run goes on.
     """
-    method = find_method(settings)
-    if method is None:
-        raise ConfigError(f"{type(settings).__name__} are settings of no training method: `rlftsim recipe` lists some.")
-    if held_out is not None and not method.validates:
-        raise ConfigError(
-            f"held_out has no effect: {method.title} does not validate, but of the methods of fine-tuning rlft, "
-            "CAT-K and RoaD do."
-        )
+    method = _find_method(settings, held_out, max_updates)
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
     out = Path(out)
@@ -85,9 +86,31 @@ def train_policy(
         settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
     )
     settings = replace(settings, device=replace(settings.device, processes=processes))
-    work = partial(_make_updates, method, policy, scenarios, out, settings, held_out, card)
+    work = partial(_make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update)
     with linked_processes(work, settings.device) as fabric:
         return work(fabric)
+
+
+def _find_method(settings: Any, held_out: TrainingScenarios | None, max_updates: int | None) -> Method[Any]:
+    """The method of settings, which has to do all that is asked of the run.
+
+    Raises:
+        ConfigError: Settings of no method, or a method that does not validate or cannot end early.
+    """
+    method = find_method(settings)
+    if method is None:
+        raise ConfigError(f"{type(settings).__name__} are settings of no training method: `rlftsim recipe` lists some.")
+    if held_out is not None and not method.validates:
+        raise ConfigError(
+            f"held_out has no effect: {method.title} does not validate, but of the methods of fine-tuning rlft, "
+            "CAT-K and RoaD do."
+        )
+    if max_updates is not None and whole_number("max_updates", max_updates, 1) and method.needs_all_updates:
+        raise ConfigError(
+            f"max_updates={max_updates} would leave no model: {method.title} has one after all updates alone. Set a "
+            "limit to the scenarios."
+        )
+    return method
 
 
 def _make_updates(
@@ -98,6 +121,8 @@ def _make_updates(
     settings: Any,
     held_out: Scenarios | None,
     card: str,
+    max_updates: int | None,
+    on_update: OnUpdate | None,
     fabric: Fabric,
 ) -> Path:
     """The model of a run: all updates that are left, in this process.
@@ -112,7 +137,7 @@ def _make_updates(
     learner = method.start(policy, scenarios, settings, fabric)
     update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     with _hold_folder(out, fabric):
-        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric, held_out)
+        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric, held_out, max_updates)
         validator = None
         if held_out is not None:
             # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
@@ -130,6 +155,8 @@ def _make_updates(
                     run.keep_best(report.values)
                 is_last = ends or is_stopped()
                 run.finish_update(replace(report, note=report.note + note), is_last=is_last)
+                if on_update is not None and fabric.is_global_zero:
+                    on_update(learner.update, dict(report.values))
                 if is_last:
                     break
         return run.finish(card)
@@ -180,10 +207,13 @@ class TrainingRun:
     """Device and processes; only rank 0 writes files."""
     held_out: Scenarios | None = None
     """Scenarios to validate on."""
+    max_updates: int | None = None
+    """Updates after which the run ends early."""
 
     def __post_init__(self) -> None:
         learner, is_first = self.learner, self.fabric.is_global_zero
-        self.num_updates = self.settings.num_updates(len(self.scenarios))
+        total = self.settings.num_updates(len(self.scenarios))
+        self.num_updates = min(total, self.max_updates or total)
         inputs = {**describe_inputs(learner.policy, self.scenarios, self.held_out), **learner.inputs}
         self.folder = RunFolder(self.out, self.settings, inputs, writes=is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
@@ -193,7 +223,7 @@ class TrainingRun:
         if self.num_updates < self.settings.warmup_updates and is_first:
             log.warning(
                 f"the run ends after {self.num_updates} of {self.settings.warmup_updates} warm-up updates, so its "
-                "weights hardly move: raise epochs, or lower warmup_updates."
+                "weights hardly move: raise epochs or max_updates, or lower warmup_updates."
             )
 
     def resume(self) -> None:
@@ -207,7 +237,7 @@ class TrainingRun:
             shorter = f" The model of the shorter one is {self.folder.model}." if self.folder.has_model else ""
             raise CheckpointError(
                 f"{self.folder.path}: a longer run was stopped here behind update {parse_update(newest)}, this one has "
-                f"{self.num_updates} updates: raise epochs again to go on with it, or name another --out.{shorter}"
+                f"{self.num_updates} updates: raise epochs or max_updates to go on, or name another --out.{shorter}"
             )
         if newest:
             progress = read_checkpoint(newest, learner.modules, learner.optimizer, learner.to_numbers())
@@ -221,8 +251,8 @@ class TrainingRun:
             if values["update"] <= learner.update:  # the process of rank 0 may not have dropped the others yet
                 self._choose_best(values)
         if self.fabric.is_global_zero and learner.update < self.num_updates:
-            for name, value in self.folder.grows_from.items():
-                log.info(f"{self.folder.model} stays the model of {value:g} {name} until the run ends.")
+            if self.folder.has_model:
+                log.info(f"{self.folder.model} stays the model of the shorter run until this one ends.")
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
             log.info(f"{self.title} {begun}: {self.num_updates} updates of {_count_weights(learner)}.")
 

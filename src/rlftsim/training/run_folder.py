@@ -34,6 +34,7 @@ from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios, list_scenario_ids
+from rlftsim.training.board import write_settings
 from rlftsim.training.checkpoint import check_weights, list_checkpoints, newest_checkpoint, parse_update
 
 if TYPE_CHECKING:
@@ -314,6 +315,8 @@ class RunFolder:
         board = self.path / "tensorboard"
         with errors_name(board):
             self._board = SummaryWriter(str(board), purge_step=update + 1)
+            if not update:
+                write_settings(self._board, flatten(self._settings))
 
     def log(self, update: int, values: Mapping[str, float]) -> None:
         """Add a line of metrics.

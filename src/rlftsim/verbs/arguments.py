@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rlftsim.scenario.open import AnyScenarios
     from rlftsim.tokens.clustering import TokensConfig
     from rlftsim.training.method import TrainingSettings
+    from rlftsim.training.run import OnUpdate as OnUpdate
 
     Model: TypeAlias = Policy | str | os.PathLike[str]
     Data: TypeAlias = AnyScenarios
@@ -39,6 +40,7 @@ else:
 
     Model = Data = Name = Metric = ModelOrRecipe = AnyRecipe = Annotated[Any, str]
     RecipeOption = Annotated[Any, Annotated[str, tyro.conf.arg(metavar="RECIPE")]]
+    OnUpdate = Any
     File = Settings = GoalPoints = Simulated = Result = Annotated[Any, Path]
     ScoreMetric = Annotated[Any, Literal["2025", "2024", "2024_original_code", "2023"]]
 

@@ -106,12 +106,12 @@ VERBS = {
     "pretrain": Verb(
         "train a model on logged tracks",
         Command("pretrain:pretrain", ("policy",), ("out",), {"policy": "RECIPE", "scenarios": "data"},
-            "print_model", ("model", "pretrain"), recipe="policy", hidden=("held_out",)),
+            "print_model", ("model", "pretrain"), recipe="policy", hidden=("held_out", "on_update")),
     ),
     "finetune": Verb(
         "fine-tune a model in closed loop with a realism reward, also with goals",
         Command("finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
-            "print_model", FINETUNING),
+            "print_model", FINETUNING, hidden=("on_update",)),
     ),
     "runs": Verb(
         "list training runs: how far they are, how good, and which settings differ",

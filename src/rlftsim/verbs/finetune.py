@@ -22,10 +22,18 @@ from rlftsim.training.config import (
     RoadConfig,
 )
 from rlftsim.training.registry import METHODS, find_method, method_by_name
-from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, Processes, Settings
+from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, OnUpdate, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
-from rlftsim.verbs.training import find_held_out, load_start, print_model, train, with_processes, write_card
+from rlftsim.verbs.training import (
+    find_held_out,
+    load_start,
+    print_model,
+    repeat_for_seeds,
+    train,
+    with_changes,
+    write_card,
+)
 
 __all__ = ["adapt_flags", "check_flags", "finetune", "print_model"]
 
@@ -67,6 +75,7 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
     _find_settings(recipe, values["recipe"], method)
 
 
+@repeat_for_seeds
 def finetune(
     policy: Model,
     scenarios: Data,
@@ -78,6 +87,11 @@ def finetune(
     goal: Literal["concat", "indication"] | None = None,
     goal_logit_bias: Annotated[bool | None, tyro.conf.arg(metavar="/ --no-goal-logit-bias")] = None,
     processes: Processes = None,
+    limit: int | None = None,
+    max_updates: int | None = None,
+    seed: int | None = None,
+    seeds: int | None = None,
+    on_update: OnUpdate | None = None,
     split: str = "training",
     validation_split: str | None = None,
 ) -> Policy:
@@ -117,6 +131,15 @@ def finetune(
         goal_logit_bias: With --goal: add a goal-progress bias to the token logits (ours, not the paper's). Left out:
             yes where goal conditioning is added, unchanged where the model has it.
         processes: Processes that train, in short for the method's device.processes.
+        limit: Number of training scenarios, the first ones; left out, all of them.
+        max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
+            weights of a run that never stopped: a learning rate that falls (catk, road, gcsl) falls as over all epochs
+            and is still high at an early end. Not for calibrate, which has a model at the end alone.
+        seed: Seed of the run, in short for the method's seed.
+        seeds: Number of runs that differ in the seed alone, from 0 on: OUT/seed-0, OUT/seed-1 and so on. Their table at
+            the end has the mean with its 95 % interval. In Python the policy of the first run is returned.
+        on_update: Function that is called behind each update with the number of updates done and the metrics by name,
+            `f(update, values)`. An error in the function ends the run, which goes on from the last checkpoint.
         split: Split of the data set to train on.
         validation_split: With rlft, catk and road: split to validate on in closed loop, see
             --finetune.validation.every. Left out: "tune", the part of "validation" that is not of the exam.
@@ -132,7 +155,7 @@ def finetune(
     """
     if isinstance(config, PretrainConfig) or find_method(config) is None:
         check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
-    training = to_scenarios(scenarios, split)
+    training = to_scenarios(scenarios, split, limit)
     settings: Any = config
     if settings is None:
         base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
@@ -140,7 +163,7 @@ def finetune(
         if not isinstance(recipe, Recipe):
             base = _complete_recipe(base, find_section(method), has_goals=goal is not None)
         settings = _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
-    settings = with_processes(settings, processes)
+    settings = with_changes(settings, processes, seed)
     trainer = find_method(settings)
     interval = settings.validation.every if trainer is not None and trainer.validates else 0
     held_out = find_held_out(scenarios, validation_split, interval)
@@ -151,7 +174,17 @@ def finetune(
         learner = with_conditioning(learner, conditioning, settings.seed, name=name)
     card = write_card(f"fine-tuned ({describe_method(settings)}{conditioning})", training, policy)
     learner = prepare_policy(learner, settings)
-    return train(learner, training, out, settings, held_out=held_out, card=card, device=device)
+    return train(
+        learner,
+        training,
+        out,
+        settings,
+        device=device,
+        held_out=held_out,
+        card=card,
+        max_updates=max_updates,
+        on_update=on_update,
+    )
 
 
 def find_section(method: str) -> str:

@@ -2,7 +2,7 @@
 
 import importlib
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from rich.table import Column, Table
 
@@ -50,6 +50,8 @@ def list_plug_ins() -> list[PlugIn]:
             try:
                 point = getattr(importlib.import_module(module), attribute)
                 problem = point.describe_problem(entry) or point.describe_refusal(entry.name)
+                if problem is None and group == "rlftsim.rewards":
+                    problem = describe_failures(entry)
             except ConfigError as error:
                 problem = str(error)
             package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
@@ -57,12 +59,27 @@ def list_plug_ins() -> list[PlugIn]:
     return plug_ins
 
 
+def describe_failures(entry: EntryPoint) -> str | None:
+    """One line about the rules that rewards of a package break, on two small scenarios; None = they break none."""
+    from rlftsim.rewards import REWARDS  # imported late, with torch: few packages have rewards
+    from rlftsim.verbs.check_reward import check_reward
+
+    package = entry.module.partition(".")[0]
+    for name in REWARDS.names():
+        if (getattr(REWARDS.get(name), "__module__", None) or "").partition(".")[0] == package or name == entry.name:
+            failures = check_reward(name).failures
+            if failures:
+                broken = "; ".join(f"{failure.rule}: {failure.detail}" for failure in failures)
+                return f"reward {name!r} of {entry.value} breaks the contract, see rs.check_reward: {broken}."
+    return None
+
+
 def plugins() -> int:
     """List what other installed packages add, with package and version, and the reason where one fails.
 
     Each is tried out, of rewards, policies, training methods, data sources, recipes, experiments, planners and
-    exporters: policies, planners and recipes are made. The exit status is 1 if one fails. The others are used all the
-    same.
+    exporters: policies, planners and recipes are made, rewards are checked on two small scenarios. The exit status is 1
+    if one fails. The others are used all the same.
     """
     plug_ins = list_plug_ins()
     if not plug_ins:

@@ -15,10 +15,18 @@ from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.config import PretrainConfig
-from rlftsim.verbs.arguments import Data, File, Model, ModelOrRecipe, Processes, Settings
+from rlftsim.verbs.arguments import Data, File, Model, ModelOrRecipe, OnUpdate, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, find_value
-from rlftsim.verbs.training import find_held_out, load_start, print_model, train, with_processes, write_card
+from rlftsim.verbs.training import (
+    find_held_out,
+    load_start,
+    print_model,
+    repeat_for_seeds,
+    train,
+    with_changes,
+    write_card,
+)
 
 __all__ = ["adapt_flags", "check_flags", "pretrain", "print_model"]
 ClassName = Literal["vehicle", "pedestrian", "cyclist"]
@@ -68,6 +76,7 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
         raise ConfigError(f"recipe {values['policy']} makes a model without a vocabulary: leave --vocabulary out.")
 
 
+@repeat_for_seeds
 def pretrain(
     policy: ModelOrRecipe,
     scenarios: Data,
@@ -79,6 +88,11 @@ def pretrain(
     keep_tokens: tuple[ClassName, ...] = (),
     init_from: Model | None = None,
     processes: Processes = None,
+    limit: int | None = None,
+    max_updates: int | None = None,
+    seed: int | None = None,
+    seeds: int | None = None,
+    on_update: OnUpdate | None = None,
     split: str = "training",
     validation_split: str | None = None,
 ) -> Policy:
@@ -110,6 +124,15 @@ def pretrain(
             registered name. It brings its vocabulary (but see --vocabulary) and the settings --model.*; flags change
             those that its weights do not depend on, such as the number of neighbors. Left out: fresh weights.
         processes: Processes that train, in short for --pretrain.device.processes.
+        limit: Number of training scenarios, the first ones; left out, all of them.
+        max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
+            weights of a run that never stopped: the learning rate falls as over all epochs, and is still high at an
+            early end.
+        seed: Seed of the run, in short for --pretrain.seed.
+        seeds: Number of runs that differ in the seed alone, from 0 on: OUT/seed-0, OUT/seed-1 and so on. Their table at
+            the end has the mean with its 95 % interval. In Python the policy of the first run is returned.
+        on_update: Function that is called behind each update with the number of updates done and the metrics by name,
+            `f(update, values)`. An error in the function ends the run, which goes on from the last checkpoint.
         split: Split of the data set to train on.
         validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "tune", the
             part of "validation" that is not of the exam.
@@ -124,14 +147,14 @@ def pretrain(
         NotYetError: Another run is at work in the folder.
     """
     check_config(config, "pretrain", PretrainConfig)
-    training = to_scenarios(scenarios, split)
+    training = to_scenarios(scenarios, split, limit)
     recipe, start = None, policy
     if isinstance(policy, Recipe) or (isinstance(policy, str) and policy in RECIPES.names()):
         recipe, start = policy, init_from
     elif init_from is not None or vocabulary is not None:
         raise ConfigError("init_from and vocabulary go with a recipe as the policy: name one, such as 'smart-demo'.")
     settings: Any = config or (PretrainConfig() if recipe is None else to_recipe(recipe).pretrain)
-    settings = with_processes(settings, processes)
+    settings = with_changes(settings, processes, seed)
     tokens = None if vocabulary is None else Vocabulary.load(Path(vocabulary))
     if held_out is None:
         validation: Scenarios | None = find_held_out(scenarios, validation_split, settings.validation.every)
@@ -140,6 +163,8 @@ def pretrain(
     if start is None:
         assert recipe is not None
         fresh = to_recipe(recipe)
+        if seed is not None:  # which the weights are drawn with
+            fresh = replace(fresh, pretrain=settings)
         if tokens is None and fresh.tokens is not None:
             tokens = build_vocabulary(training, fresh.tokens)[0]
         learner: Any = fresh.new_policy(tokens)
@@ -153,7 +178,17 @@ def pretrain(
             replaced = () if tokens is None else (tokens, keep_tokens)
             learner = like.train_further(learner, *replaced)  # pyright: ignore[reportArgumentType]
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
-    return train(learner, training, out, settings, held_out=validation, card=card, device=device)
+    return train(
+        learner,
+        training,
+        out,
+        settings,
+        device=device,
+        held_out=validation,
+        card=card,
+        max_updates=max_updates,
+        on_update=on_update,
+    )
 
 
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:

@@ -8,17 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from rlftsim.errors import DataError, in_short
 from rlftsim.jobs.folder import recognize_folder
 from rlftsim.jobs.progress import print_wide
+from rlftsim.statistics import mean_interval
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, may_change, read_metrics, stored_settings
 
 VALIDATION, BOUND = "validation_rmm", "validation_gain_low"
 MEASURES = (VALIDATION, "rmm", "loss", "imitation_loss")
 """Metrics that say how good a model is, the most telling first; losses are better where they are lower."""
 NO_VALUE = "–"
+SEED_FOLDER = "seed-"
+"""Beginning of the name of a run's folder, of several that differ in the seed alone."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,8 @@ def runs(folders: list[str]) -> list[RunSummary]:
     Example: `rlftsim runs runs/*`
 
     The metric is the RMM of validation where a run has validated; else the RMM of its training rollouts or the loss,
-    whose mean over the last tenth of the updates is "last". Values of different data do not compare.
+    whose mean over the last tenth of the updates is "last". Values of different data do not compare. Runs of --seeds
+    have their mean in a table of its own.
 
     Args:
         folders: Folders of runs; other files and folders are passed over, if there is a run among them.
@@ -115,6 +120,22 @@ def find_differences(training_runs: Sequence[RunSummary]) -> dict[str, list[str]
     return rows
 
 
+def find_seeds(training_runs: Sequence[RunSummary]) -> list[list[RunSummary]]:
+    """Groups of two or more runs side by side in folders seed-N that differ in the seed alone.
+
+    Args:
+        training_runs: Runs of any methods.
+    """
+    groups: dict[object, list[RunSummary]] = {}
+    for run in training_runs:
+        # fresh weights are drawn with the seed
+        equal = {name: value for name, value in run.settings.items() if name not in ("seed", "initial_policy")}
+        if run.folder.name.startswith(SEED_FOLDER):
+            key = (run.folder.absolute().parent, run.measure, json.dumps(equal, sort_keys=True))
+            groups.setdefault(key, []).append(run)
+    return [group for group in groups.values() if len(group) > 1]
+
+
 def print_runs(training_runs: list[RunSummary]) -> None:
     """Print a table of runs, and one of the settings in which they differ.
 
@@ -140,7 +161,20 @@ def print_runs(training_runs: list[RunSummary]) -> None:
     differences = Table("setting", *names)
     for name, values in find_differences(training_runs).items():
         differences.add_row(name, *values)
-    print_wide(table, *([differences] if differences.row_count else []))
+    means = Table("mean over seeds, 95 % interval", "seeds", "metric", "last", "best")
+    for group in find_seeds(training_runs):
+        last, best = [run.last for run in group], [run.best and run.best[1] for run in group]
+        label = _shorten_names([run.folder for run in training_runs])[training_runs.index(group[0])]
+        means.add_row(f"{label} …", str(len(group)), group[0].measure, _average(last), _average(best))
+    print_wide(table, *(further for further in (differences, means) if further.row_count))
+
+
+def _average(values: Sequence[float | None]) -> str:
+    """Mean and interval (Student's t) as text; a dash where a value is missing."""
+    if None in values:
+        return NO_VALUE
+    mean, (low, high) = (estimate := mean_interval(np.array(values, float))).mean, estimate.interval
+    return f"{mean:.5g} [{low:.5g}, {high:.5g}]"
 
 
 def _shorten_names(folders: Sequence[Path]) -> list[str]:

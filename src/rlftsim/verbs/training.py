@@ -3,16 +3,18 @@
 import copy
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 from torch import nn
 
-from rlftsim.errors import ConfigError, RlftsimError
-from rlftsim.evaluation.learning_curve import write_calibration_picture, write_learning_curve
+from rlftsim.errors import ConfigError, RlftsimError, whole_number
+from rlftsim.evaluation.learning_curve import film_model, write_calibration_picture, write_learning_curve
 from rlftsim.jobs.progress import log, print_line
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.card import append_cards, model_card
@@ -23,7 +25,10 @@ from rlftsim.scenario.types import Scenarios
 from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
 from rlftsim.verbs.inputs import to_policy
+from rlftsim.verbs.runs import SEED_FOLDER, print_runs
+from rlftsim.verbs.runs import runs as list_runs
 
+Parameters = ParamSpec("Parameters")
 VALIDATION = "validation"
 TUNE = "tune"
 """Split that is validated on where none is named: the part of "validation" that is not of the exam."""
@@ -52,9 +57,8 @@ def train(
     out: str | os.PathLike[str] | None,
     settings: Any,
     *,
-    held_out: Scenarios | None,
-    card: str,
     device: Any,
+    **options: Any,
 ) -> Any:
     """The policy, trained in place and ready to simulate; the pictures of its run are drawn.
 
@@ -63,33 +67,62 @@ def train(
         scenarios: Training scenarios, with their futures.
         out: Folder of the run; None = a temporary one.
         settings: Settings of the method.
-        held_out: Scenarios for validation; None = no validation.
-        card: README of the model folder.
         device: Device of the result.
+        options: Further arguments of `train_policy`, such as the scenarios for validation.
     """
     # Weights of a loaded policy are frozen; each method freezes again what it does not train.
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)
     if out is None:
         with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
-            train_policy(policy, scenarios, folder, settings, held_out=held_out, card=card)
+            train_policy(policy, scenarios, folder, settings, **options)
     else:
         with _learning_curve(Path(out)):
-            model = train_policy(policy, scenarios, out, settings, held_out=held_out, card=card)
+            model = train_policy(policy, scenarios, out, settings, **options)
         if is_first_process():
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
-    return policy.eval().requires_grad_(False).to(device)
+    policy.eval().requires_grad_(False).to(device)
+    if out is not None and is_first_process():
+        with suppress(RlftsimError, OSError):  # a picture is no reason to lose a model
+            film_model(Path(out), policy, (options["held_out"] or scenarios)[0])
+    return policy
 
 
-def print_model(policy: Policy, *, out: Path) -> None:
-    """Print where the model is.
+def repeat_for_seeds(verb: Callable[Parameters, Policy]) -> Callable[Parameters, Policy]:
+    """Decorator of a verb that trains: with `seeds` it runs as often, with a seed and a folder for each.
+
+    The policy of the first run is returned.
+    """
+
+    @wraps(verb)
+    def train_runs(*arguments: Any, seeds: int | None = None, **options: Any) -> Policy:
+        if seeds is None:
+            return verb(*arguments, **options)
+        call = signature(verb).bind(*arguments, **options).arguments
+        if call.get("out") is None or call.get("seed") is not None:
+            raise ConfigError(f"seeds={seeds}: several runs need a folder for theirs, out, and each has its seed.")
+        policies = []
+        for seed in range(whole_number("seeds", seeds, 1)):
+            changes: Any = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
+            policies.append(verb(**changes))
+        return policies[0]
+
+    return train_runs
+
+
+def print_model(policy: Policy, *, out: Path, seeds: int | None) -> None:
+    """Print where the model is, or the table of several runs.
 
     Args:
         policy: Trained policy.
         out: Folder of the run.
+        seeds: Number of runs with different seeds; None = a single one.
     """
-    print_line(f"model: {out / 'model'}")
+    if seeds is None:
+        print_line(f"model: {out / 'model'}")
+    else:
+        print_runs(list_runs([str(folder) for folder in sorted(out.glob(f"{SEED_FOLDER}*"))]))
 
 
 def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str:
@@ -109,14 +142,17 @@ def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str
     return append_cards(card, [] if name is None else [name])
 
 
-def with_processes(settings: Any, processes: Any) -> Any:
-    """Settings of a run on so many processes; the settings themselves for None.
+def with_changes(settings: Any, processes: Any, seed: int | None) -> Any:
+    """Settings of a run on so many processes and with this seed; None leaves either as it is.
 
     Args:
         settings: Settings of the method.
         processes: Number of processes, "auto", or None.
+        seed: Seed of the run, or None.
     """
-    return settings if processes is None else replace(settings, device=replace(settings.device, processes=processes))
+    if processes is not None:
+        settings = replace(settings, device=replace(settings.device, processes=processes))
+    return settings if seed is None else replace(settings, seed=whole_number("seed", seed, 0))
 
 
 def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 from jaxtyping import UInt8
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
@@ -79,7 +80,11 @@ class Camera:
             shapes = agent_shapes(scene.agents, panel, step)
             for shape in shapes:
                 axis.add_collection(shape, autolim=False)
-            for shape in (*shapes, light_dots(axis, scene, lights_at)):
+            drawn: list[Artist] = [*shapes, light_dots(axis, scene, lights_at)]
+            if panel.notes:
+                corner = {"transform": axis.transAxes, "va": "top", "bbox": {"color": "white", "alpha": 0.7, "pad": 2}}
+                drawn.append(axis.text(0.02, 0.98, panel.notes[step], fontsize=8, **corner))
+            for shape in drawn:
                 axis.draw_artist(shape)
                 shape.remove()
         pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]

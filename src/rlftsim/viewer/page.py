@@ -24,6 +24,8 @@ class Panel:
 
     title: str
     trajectories: SceneMotion
+    notes: Sequence[str] = ()
+    """Text in the corner of films, for each step of the motion."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,9 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
 )
 """Name -> class of a planner, or a function from observation to action."""
 
+SB3 = "sb3:"
+"""Beginning of the name of a planner in a file of Stable-Baselines3."""
+
 
 @runtime_checkable
 class Planner(Protocol):
@@ -79,12 +82,14 @@ def load_planner(name: str) -> Planner:
 
     Args:
         name: Registered name, or "package.module:Class" (or ":function") of code that can be imported; options are
-            written behind either, "careful:Careful(headway=1.0)".
+            written behind either, "careful:Careful(headway=1.0)". Or "sb3:FILE" of Stable-Baselines3.
 
     Raises:
         ConfigError: Unknown, not importable, neither an object with `reset` and `act` nor a function, with other
             arguments than these, without such an option, or with an unknown type of action.
     """
+    if name.startswith(SB3):
+        return _load_sb3(name.removeprefix(SB3))
     location, options = _split_options(name)
     if ":" in location:
         module, _, attribute = location.partition(":")
@@ -120,6 +125,19 @@ def load_planner(name: str) -> Planner:
     _check_argument(f"act of planner {name!r}", planner.act, "observation")
     read_action_settings(planner)  # an unknown action ends here, not in the first episode
     return planner
+
+
+def _load_sb3(path: str) -> Planner:
+    """Planner of a file of Stable-Baselines3.
+
+    Raises:
+        ConfigError: The package is missing, or no such file, or another policy than `Sb3Planner` takes.
+    """
+    try:
+        from rlftsim.envs.planners.sb3 import Sb3Planner  # a package of its own, which few have
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"planner sb3:{path}: {error.name} is missing: pip install stable-baselines3.") from None
+    return Sb3Planner(path)
 
 
 def _split_options(name: str) -> tuple[str, dict[str, Any]]:
@@ -219,6 +237,8 @@ def hash_code(name: str) -> str:
         name: Name of the planner, as `load_planner` takes it.
     """
     planner = load_planner(name)
+    if name.startswith(SB3):
+        return hash_file(name.removeprefix(SB3))
     code: Any = planner.function if isinstance(planner, CallablePlanner) else planner
     code = code.func if isinstance(code, partial) else code
     sources: list[Any] = [code if inspect.isroutine(code) else type(code)]
