@@ -86,6 +86,24 @@ def to_policy(policy: Any, device: Device = "auto") -> Policy:
     return policy
 
 
+def read_result(result: Any, result_type: Any) -> Any:
+    """A result as it is, or from its file.
+
+    Args:
+        result: Evaluation or result of a drive, or path of a file.
+        result_type: Class of the result, `Evaluation` or `DriveResult`.
+
+    Raises:
+        ConfigError: Neither a result of this class nor a path.
+        DataError: No such file, or a file of something else.
+    """
+    if isinstance(result, str | os.PathLike):
+        return result_type.read(result)
+    if not isinstance(result, result_type):
+        raise ConfigError(f"{type(result).__name__}: not an evaluation: hand over one of rs.evaluate, or its file.")
+    return result
+
+
 def to_batch(scenarios: Any, device: torch.device | str = "cpu") -> ScenarioBatch:
     """Batch of scenarios; a batch stays as it is but for the device.
 
