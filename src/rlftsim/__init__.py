@@ -35,6 +35,7 @@ __all__ = [
     "check_policy",
     "compare",
     "evaluate",
+    "film",
     "finetune",
     "leave_one_out",
     "load_dataset",
@@ -74,7 +75,7 @@ _MODULES = {
     "rlftsim.verbs.report": ("report",),
     "rlftsim.verbs.score": ("score",),
     "rlftsim.verbs.simulate": ("simulate",),
-    "rlftsim.viewer.notebook": ("show",),
+    "rlftsim.viewer.notebook": ("film", "show"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

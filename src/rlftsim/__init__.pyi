@@ -26,6 +26,7 @@ from rlftsim.verbs.recipe import recipe as recipe
 from rlftsim.verbs.report import report as report
 from rlftsim.verbs.score import score as score
 from rlftsim.verbs.simulate import simulate as simulate
+from rlftsim.viewer.notebook import film as film
 from rlftsim.viewer.notebook import show as show
 
 __version__: str

@@ -22,7 +22,7 @@ from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
-from rlftsim.verbs.inputs import to_policy
+from rlftsim.verbs.inputs import remember_name, to_policy
 
 VALIDATION = "validation"
 TUNE = "tune"
@@ -79,7 +79,10 @@ def train(
         if is_first_process():
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
-    return policy.eval().requires_grad_(False).to(device)
+    policy.eval().requires_grad_(False).to(device)
+    if out is not None:
+        remember_name(policy, out)
+    return policy
 
 
 def print_model(policy: Policy, *, out: Path) -> None:
