@@ -42,8 +42,8 @@ NAMES = [
     *("score", "RealismResult"),
     *("register_reward", "leave_one_out", "masked_mean", "check_reward"),
     *("recipe", "pretrain", "finetune", "FinetuneConfig"),
-    *("evaluate", "Evaluation", "compare"),
-    *("show", "open_studio"),
+    *("evaluate", "Evaluation", "compare", "report"),
+    *("show", "film", "open_studio"),
     "RlftsimError",
 ]
 SMALL = "data/small"
@@ -684,6 +684,40 @@ def test_scenarios_and_rollouts_play_in_a_cell(base, data, tmp_path):
     assert "rollouts" in rollouts._repr_html_()
     assert replace(rollouts, provenance=None)._repr_html_() is None
     assert len(scenario._repr_html_()) < 300_000
+
+
+def test_the_ending_of_a_file_decides_between_a_page_and_a_film(data, tmp_path):
+    rollouts = rs.simulate(rs.ConstantVelocity(), data[0], num_rollouts=1)
+    assert rs.film(data[0], rollouts, tmp_path / "film.GIF") == tmp_path / "film.GIF"
+    assert (tmp_path / "film.GIF").read_bytes()[:3] == b"GIF"
+    rs.show(data[0], rollouts).save(tmp_path / "film.mp4")
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    with pytest.raises(ConfigError, match=r"film.avi: a page ends in .html, a film in .mp4, .webp, .gif"):
+        rs.show(data[0], rollouts).save(tmp_path / "film.avi")
+    with pytest.raises(ConfigError, match=r"page.html: a film is .mp4 or .webp or .gif"):
+        rs.film(data[0], rollouts, tmp_path / "page.html")
+    assert len(list(tmp_path.glob("film.*"))) == 2
+
+
+def test_an_evaluation_bears_the_name_that_its_model_was_loaded_by_unless_it_was_changed_since(base, data):
+    loaded = rs.load_policy("runs/base")
+    assert rs.evaluate(loaded, data, num_rollouts=1).name == "base"
+    next(iter(loaded.parameters())).data += 0.1
+    assert rs.evaluate(loaded, data, num_rollouts=1).name.startswith("SmartPolicy-")
+
+
+def test_a_trained_model_is_named_like_its_run(base, home):
+    tuned = rs.finetune(base, rs.load_dataset(SMALL, "training"), "runs/named", few_updates())
+    assert rs.evaluate(tuned, SMALL, num_rollouts=1).name == "named"
+
+
+def test_a_notebook_shows_an_error_of_ours_in_one_line_and_all_of_it_when_asked(capsys):
+    shell = pytest.importorskip("IPython.core.interactiveshell").InteractiveShell()
+    shell.run_cell("import rlftsim as rs; rs.load_policy('nothing-of-this-name')")
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("ConfigError: 'nothing-of-this-name' is neither a model folder nor one of")
+    shell.run_cell("import traceback; traceback.print_last()")
+    assert "registry.py" in "".join(capsys.readouterr())
 
 
 def test_what_cannot_be_shown_is_refused(data):

@@ -36,6 +36,7 @@ __all__ = [
     "check_reward",
     "compare",
     "evaluate",
+    "film",
     "finetune",
     "leave_one_out",
     "load_dataset",
@@ -45,6 +46,7 @@ __all__ = [
     "pretrain",
     "recipe",
     "register_reward",
+    "report",
     "score",
     "show",
     "simulate",
@@ -73,9 +75,10 @@ _MODULES = {
     "rlftsim.verbs.inputs": ("load_dataset", "load_policy"),
     "rlftsim.verbs.pretrain": ("pretrain",),
     "rlftsim.verbs.recipe": ("recipe",),
+    "rlftsim.verbs.report": ("report",),
     "rlftsim.verbs.score": ("score",),
     "rlftsim.verbs.simulate": ("simulate",),
-    "rlftsim.viewer.notebook": ("show",),
+    "rlftsim.viewer.notebook": ("film", "show"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

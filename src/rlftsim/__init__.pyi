@@ -25,8 +25,10 @@ from rlftsim.verbs.inputs import load_dataset as load_dataset
 from rlftsim.verbs.inputs import load_policy as load_policy
 from rlftsim.verbs.pretrain import pretrain as pretrain
 from rlftsim.verbs.recipe import recipe as recipe
+from rlftsim.verbs.report import report as report
 from rlftsim.verbs.score import score as score
 from rlftsim.verbs.simulate import simulate as simulate
+from rlftsim.viewer.notebook import film as film
 from rlftsim.viewer.notebook import show as show
 
 __version__: str

@@ -21,6 +21,10 @@ class RlftsimError(Exception):
     def __str__(self) -> str:
         return shorten(super().__str__())
 
+    def _render_traceback_(self) -> list[str]:
+        """What a notebook shows: one line. `traceback.print_last()` in the next cell shows all frames."""
+        return [f"{type(self).__name__}: {self}"]
+
 
 class DataError(RlftsimError):
     """A file, record or scenario that cannot be used; the message names the file, the record and the reason."""

@@ -1,11 +1,9 @@
-import io
 import math
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from rlftsim.evaluation.report import (
     ChartGroup,
@@ -13,7 +11,6 @@ from rlftsim.evaluation.report import (
     Report,
     ResultRow,
     report_html,
-    report_table,
     write_report,
 )
 from rlftsim.statistics import MeanInterval, interval_around
@@ -78,9 +75,9 @@ def report() -> Report:
             ),
             ResultRow("oracle", {"meta_metric": measured(0.9, 0.01)}, note="the log"),
         ],
-        comparison=PairedComparison(
-            "base", "fine-tuned", 0.02, (0.01, 0.03), 0.0004, 3, differences=[0.01, 0.02, 0.03]
-        ),
+        comparisons=[
+            PairedComparison("base", "fine-tuned", 0.02, (0.01, 0.03), 0.0004, 3, differences=[0.01, 0.02, 0.03])
+        ],
         chart_groups=[ChartGroup("Pre-training", [Chart("Loss", "update", "nats", [loss])])],
         animations=[draw_animation(), draw_animation()],
         facts={"command": "rlftsim demo <quick>"},
@@ -129,7 +126,7 @@ def test_report_with_nothing_but_a_title_is_a_page():
 
 @pytest.mark.parametrize(
     "missing",
-    [{"rows": ()}, {"comparison": None}, {"chart_groups": ()}, {"animations": ()}, {"facts": {}}, {"footnotes": ()}],
+    [{"rows": ()}, {"comparisons": ()}, {"chart_groups": ()}, {"animations": ()}, {"facts": {}}, {"footnotes": ()}],
     ids=lambda missing: next(iter(missing)),
 )
 def test_each_part_may_be_missing(report, missing):
@@ -159,7 +156,7 @@ def test_missing_and_undefined_numbers_are_dashes():
 def test_verdict_follows_the_interval(interval, words):
     comparison = PairedComparison("base", "fine-tuned", 0.01, interval, 0.04, 20)
     assert words in comparison.verdict_text
-    assert words in report_html(Report("t", comparison=comparison))
+    assert words in report_html(Report("t", comparisons=[comparison]))
 
 
 def test_own_verdict_is_kept():
@@ -172,22 +169,9 @@ def test_a_difference_without_an_interval_is_drawn_without_one():
     comparison = PairedComparison(
         "a", "b", 0.01, nothing, nothing[0], 2, differences=[0.0, 0.02], verdict="One network."
     )
-    page = report_html(Report("t", comparison=comparison))
+    page = report_html(Report("t", comparisons=[comparison]))
     assert "nan" not in page
     assert page.count("<circle") == 3
-
-
-def test_terminal_table_has_the_same_numbers(report):
-    out = io.StringIO()
-    Console(file=out, width=120, markup=False).print(report_table(report))
-    text = out.getvalue()
-    assert "0.7000 ± 0.0100" in text
-    assert "collision [%] ↓" in text
-    assert "5.10 ± 0.20" in text
-
-
-def test_report_without_rows_prints_an_empty_table():
-    Console(file=io.StringIO()).print(report_table(Report("Empty")))
 
 
 def test_drift_has_a_table_of_its_own_where_it_was_measured():

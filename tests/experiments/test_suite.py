@@ -290,12 +290,15 @@ def test_mistakes_end_in_a_line(words, message, tmp_path, capsys):
 
 
 def test_the_demo_runs_the_same_stages(data, tmp_path):
-    result = run_demo(DemoConfig(TINY, data, QUICK, num_scenes=1, rollouts_shown=2), tmp_path)
+    result = run_demo(DemoConfig(TINY, data, QUICK, num_played=1, num_listed=1, is_quick=True), tmp_path)
     page = result.report.read_text()
     assert [e.name for e in result.evaluations] == ["base", "fine-tuned", "constant velocity", "oracle"]
     assert "what a perfect simulator would score" in page
     assert "2 held-out scenarios, 4 rollouts each" in page
     assert page.count("Scenario c") + page.count("Scenario d") >= 1
+    assert "Quick run: every stage at its smallest size. These numbers mean nothing" in page
+    assert "RLFTSim demo: closed-loop fine-tuning of a traffic model" in page  # no claim
+    assert {path.suffix for path in (tmp_path / "scenarios").iterdir()} == {".html", ".mp4"}
     assert (tmp_path / "picture.png").exists()
 
 

@@ -1,9 +1,11 @@
 """Tables in the terminal."""
 
 import ast
+import re
 import sys
 from pathlib import Path
 
+import pytest
 from rich.table import Table
 
 import rlftsim
@@ -50,3 +52,19 @@ def test_lines_of_a_card_stay_lines_without_control_characters(capsys):
 def test_a_long_name_is_printed_without_its_middle(capsys):
     print_line("a" * 100_000)
     assert "characters and more" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("columns", [40, 80, 120])
+def test_no_cell_of_a_table_is_cut_whatever_the_width(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    table = Table()
+    table.add_column("label", no_wrap=True)
+    for number in range(6):
+        table.add_column(f"a_name_of_a_model_{number}", justify="right")
+    table.add_row("a label that may not be broken", *["0.7965 ± 0.0193"] * 6)
+    print_wide(table)
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= columns
+    assert out.count("±") == 6
+    assert sum(out.count(sign) for sign in "0123456789") == 6 * 10 + 6
+    assert len(re.findall(r"[a-z]", out)) == len("labelalabelthatmaynotbebroken") + 6 * len("anameofamodel")

@@ -37,9 +37,10 @@ def test_an_mp4_plays_the_future_in_real_time_and_everybody_moves(animation, tmp
     assert all(after - before > 10 for before, after in zip(now, later))  # the ego drives to the right in both panels
 
 
-def test_a_webp_plays_where_pictures_are_shown(animation, tmp_path):
-    to_film(tmp_path / "film.webp", animation, steps_per_frame=10, dots_per_inch=50)
-    with Image.open(tmp_path / "film.webp") as film:
+@pytest.mark.parametrize("ending", ["webp", "gif"])
+def test_a_moving_picture_plays_where_pictures_are_shown(ending, animation, tmp_path):
+    to_film(tmp_path / f"film.{ending}", animation, steps_per_frame=10, dots_per_inch=50)
+    with Image.open(tmp_path / f"film.{ending}") as film:
         assert film.is_animated
         assert film.size == (400, 234)
         first = np.array(film.convert("RGB"))
@@ -48,7 +49,7 @@ def test_a_webp_plays_where_pictures_are_shown(animation, tmp_path):
 
 
 def test_other_endings_are_refused_by_name(animation, tmp_path):
-    with pytest.raises(ConfigError, match=r"film.avi: a film is .mp4 or .webp"):
+    with pytest.raises(ConfigError, match=r"film.avi: a film is .mp4 or .webp or .gif"):
         to_film(tmp_path / "film.avi", animation)
     assert not list(tmp_path.iterdir())
 

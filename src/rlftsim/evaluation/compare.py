@@ -288,7 +288,7 @@ def format_table(*evaluations: Evaluation) -> Table:
     table = Table(caption=describe_data(*evaluations) or None, caption_justify="left")
     table.add_column("", no_wrap=True)
     for evaluation in evaluations:
-        table.add_column(evaluation.name, justify="right", overflow="fold")
+        table.add_column(evaluation.name, justify="right")
     counts = [f"{len(evaluation)}{_with_rmm(evaluation.num_with_rmm, len(evaluation))}" for evaluation in evaluations]
     table.add_row("scenarios", *counts)
     for column in select_columns(*evaluations):
@@ -339,7 +339,7 @@ def comparison_table(name_a: str, name_b: str, alpha: float) -> Table:
     )
     table.add_column("", no_wrap=True)
     for name in (name_a, name_b, "change", f"{100 - 100 * alpha:g} %", "to", "p"):
-        table.add_column(name, justify="right", overflow="fold")
+        table.add_column(name, justify="right")
     table.add_column("verdict", no_wrap=True)
     return table
 

@@ -156,6 +156,25 @@ def simulate_states(
     return joined if is_random else replace(joined, repeat=config.num_rollouts)
 
 
+def simulate_evaluated(policy: Policy | Oracle, batch: ScenarioBatch, config: EvaluateConfig) -> SimulatedStates:
+    """Rollouts of a scenario as an evaluation scores them.
+
+    Args:
+        policy: Policy of all agents, or "oracle" for the log.
+        batch: The scenario alone, with a logged future.
+        config: Number of rollouts, seed, sampling, goals.
+
+    Raises:
+        ConfigError, DataError: See `simulate_states`.
+    """
+    device = get_device(policy)
+    if isinstance(policy, str):
+        return logged_states(batch.scenarios[0], num_rollouts=config.num_rollouts, device=device)
+    batch = batch.to(device)
+    goals = logged_goals(batch, batch.evaluated_mask) if config.goals == "logged" else None
+    return simulate_states(policy, batch, config, goals=goals)
+
+
 def _evaluate_group(
     policy: Policy | Oracle,
     dataset: ScenarioDataset,
@@ -186,12 +205,7 @@ def _evaluate_group(
         except DataError as error:
             results.append(Skipped(scenario.scenario_id, str(error)))
         else:
-            if isinstance(policy, str):
-                states = logged_states(scenario, num_rollouts=config.num_rollouts, device=device)
-            else:
-                batch = collate([scenario]).to(device)
-                goals = logged_goals(batch, batch.evaluated_mask) if config.goals == "logged" else None
-                states = simulate_states(policy, batch, config, goals=goals)
+            states = simulate_evaluated(policy, collate([scenario]), config)
             result = score(log, states, metric_by_name(config.metric))
             results.append(row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id)))
         advance(1)

@@ -1,12 +1,13 @@
 """Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
 from operator import itemgetter
 from os import PathLike
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +28,7 @@ from rlftsim.viewer.chart import Chart, Curve, chart_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
+Item = TypeVar("Item")
 MAX_STRIPS = 10
 """Rows of (feature, agent) drawn over time."""
 MAX_SHOWN_ROLLOUTS = 8
@@ -89,54 +91,82 @@ def explain_rollouts(
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
         items[next(page for page in (f"{n}.html" for n in numbered) if page not in items)] = entry
     identity = repr((hash_entries(entries), hash_source(source), config.metric, config.missing_map, __version__))
-    pages = Path(out) / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
     runner = runner or choose_runner(config.num_jobs, len(items))
-    with Lease(pages / ".lock", runner, "works in") as lease:
+    return write_files("explain", items, partial(_write_page, source, config), Path(out), identity, runner)
+
+
+def write_files(
+    title: str, items: Mapping[str, Item], write: Callable[[Path, Item], None], out: Path, identity: str, runner: Runner
+) -> list[Path]:
+    """Write a file for each item; a call that was interrupted goes on. Returns the files that are not empty.
+
+    Args:
+        title: Name of the work, in front of the progress bar.
+        items: Items by name of the file, such as "a.html".
+        write: Function that writes the file of an item, whole or not at all; picklable for other processes.
+        out: Folder of the files, made if missing. Unfinished work lies in a folder of its own inside.
+        identity: Text that is equal for the same work.
+        runner: Runner of the items.
+
+    Raises:
+        DataError: Another driver at work on these files.
+        SetAside, Unfinished: See `run_items`.
+    """
+    folder = out / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
+    with Lease(folder / ".lock", runner, "works in") as lease:
         finished = run_items(
-            "explain", list(items.items()), partial(_write_page, pages, source, config), lease=lease, runner=runner,
-            format=WholeFiles(pages, itemgetter(0), _read_page),
+            title, list(items.items()), partial(_write_file, write, folder), lease=lease, runner=runner,
+            format=WholeFiles(folder, itemgetter(0), _read_page),
         )  # fmt: skip
-        written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
+        written = [file.replace(out / file.name) for file in finished if file.stat().st_size]
         lease.remove()
-        remove_folder(pages, items)
+        remove_folder(folder, items)
     return written
 
 
+def _write_file(
+    write: Callable[[Path, Any], None],
+    folder: Path,
+    item: tuple[str, Any],
+    advance: Advance,
+    is_stopped: Callable[[], bool],
+) -> None:
+    """Write the file of an item, unless the work is being stopped."""
+    if not is_stopped():
+        write(folder / item[0], item[1])
+        advance(1)
+
+
 def _read_page(path: Path) -> str:
-    """Text of a page, empty where there is nothing to explain.
+    """Text of a page, empty where there is nothing to explain; nothing of a film.
 
     Raises:
         DataError: The page is cut off.
     """
-    html = path.read_text(encoding="utf-8", errors="replace")
+    html = path.read_text(encoding="utf-8", errors="replace") if path.suffix == ".html" else ""
     if html and not html.endswith("</html>\n"):
         raise DataError(f"{path}: its end is missing.")
     return html
 
 
-def _write_page(
-    folder: Path,
-    source: ScenarioSource,
-    config: ScoreConfig,
-    item: tuple[str, RolloutEntry],
-    advance: Advance,
-    is_stopped: Callable[[], bool],
-) -> None:
-    """Write a page, empty for a scenario without a score, unless the work is being stopped."""
-    if is_stopped():
-        return
-    name, entry = item
+def _write_page(source: ScenarioSource, config: ScoreConfig, path: Path, entry: RolloutEntry) -> None:
+    """Write a page, empty for a scenario without a score."""
     scenario = source.by_id(entry.scenario_id) if entry.scenario_id in source else None
     html = ""
     # Without road edges there is no score to explain; scoring says so.
     if scenario is not None and (config.missing_map == "error" or has_road_edge(scenario)):
         html = explanation_html(explain(scenario, read_states(entry), config.official_metric))
-    write_text(folder / name, html)
-    advance(1)
+    write_text(path, html)
 
 
-def explanation_html(explanation: Explanation) -> str:
-    """The page of an explanation as HTML."""
+def explanation_html(explanation: Explanation, policy: str = "") -> str:
+    """The page of an explanation as HTML.
+
+    Args:
+        explanation: Score of a scenario with its costs.
+        policy: Name of what made the rollouts, for the heading; empty = not named.
+    """
+    heading = f"Scenario {explanation.scenario.scenario_id}{f', {policy}' if policy else ''}"
     name, result = explanation.scenario.scenario_id, explanation.result
     metric = escape(explanation.config.name)
     lead = (
@@ -158,7 +188,7 @@ def explanation_html(explanation: Explanation) -> str:
         Panel(f"first {first_rollouts.num_rollouts} rollouts", first_rollouts),
     ]
     sections = [
-        f"<h1>Scenario {escape(name)}</h1>",
+        f"<h1>{escape(heading)}</h1>",
         f'<p class="lead">{lead}</p>',
         f'<div class="tiles">{tiles}</div>',
         "<h2>Which feature</h2>",
@@ -176,7 +206,7 @@ def explanation_html(explanation: Explanation) -> str:
         "<h2>What happened</h2>",
         animation_html(Animation(f"Scenario {name}", build_scene(explanation.scenario), panels)),
     ]
-    return page_html(f"Scenario {name}", "\n".join(sections), extra_css=_CSS)
+    return page_html(heading, "\n".join(sections), extra_css=_CSS)
 
 
 def _features_html(explanation: Explanation) -> str:

@@ -7,11 +7,11 @@ csv = "my_package:write_csv"
 """
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Column, Table
+from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.explain import to_scene_motion
@@ -70,7 +70,7 @@ def write_player(scenario: Scenario, states: SimulatedStates, folder: Path) -> P
     Raises:
         DataError: A file that cannot be written.
     """
-    path, animation = folder / f"{scenario.scenario_id}.html", _animation(scenario, states)
+    path, animation = folder / f"{scenario.scenario_id}.html", animate_states(scenario, {"rollouts": states})
     write_page(path, animation.title, [animation])
     return path
 
@@ -87,18 +87,27 @@ def write_film(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pat
         DataError: A file that cannot be written.
     """
     path = folder / f"{scenario.scenario_id}.mp4"
-    to_film(path, _animation(scenario, states))
+    to_film(path, animate_states(scenario, {"rollouts": states}))
     return path
 
 
-def _animation(scenario: Scenario, states: SimulatedStates) -> Animation:
-    """The log, and the first rollouts."""
+def animate_states(
+    scenario: Scenario, states: Mapping[str, SimulatedStates], *, max_rollouts: int = MAX_ROLLOUTS, caption: str = ""
+) -> Animation:
+    """The log, and the first rollouts beside it.
+
+    Args:
+        scenario: Scenario with the map and log that are drawn.
+        states: Rollouts of the scenario, world frame, by the title of a panel.
+        max_rollouts: Rollouts that can be played; each adds about 50 kB to a page.
+        caption: Text below the title.
+    """
     scene = build_scene(scenario)
-    panels = [
-        Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents)),
-        Panel("rollouts", to_scene_motion(scenario, states).first(MAX_ROLLOUTS).with_overlaps(scene.agents)),
-    ]
-    return Animation(f"Scenario {scenario.scenario_id}", scene, panels)
+    panels = [Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents))]
+    for title, simulated in states.items():
+        motion = to_scene_motion(scenario, simulated).first(max_rollouts)
+        panels.append(Panel(title, motion.with_overlaps(scene.agents)))
+    return Animation(f"Scenario {scenario.scenario_id}", scene, panels, caption=caption)
 
 
 def report_rollouts(
@@ -168,7 +177,7 @@ def _outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
     """Table of goals and outcomes, for `print_wide`."""
     headings = ("scenario", "agent", "label", "reached", "passed", "closest [m]: best", "median")
     table = Table(
-        *(Column(heading, overflow="fold") for heading in headings),
+        *headings,
         title="goals: within 2 m in the end (reached), at any time (passed)",
         caption="closest: smallest distance to the goal, in the best rollout and in the median one",
         title_justify="left",

@@ -31,14 +31,9 @@ def write_learning_curve(run: Path) -> Path | None:
     Returns:
         The picture; None if the run has no metrics yet.
     """
-    lines = read_metrics(run)
-    if not lines:
+    charts = run_charts(read_metrics(run))
+    if not charts:
         return None
-    # Only fine-tuning with a reward logs the realism of its own rollouts.
-    if "credit_std" in lines[0]:  # a calibration has no updates that follow each other
-        charts = [_chart(lines, "Realism of the rollouts", "RMM", rmm="RMM")]
-    else:
-        charts = finetuning_charts(lines) if "rmm" in lines[0] else imitation_charts(lines)
     charts_to_png(run / "learning_curve.png", charts)
     return run / "learning_curve.png"
 
@@ -63,6 +58,21 @@ def film_model(run: Path, policy: Policy, scenario: Scenario) -> None:
     lines = read_metrics(run)
     with SummaryWriter(str(run / "tensorboard")) as board:
         write_film(board, frames, int(lines[-1]["update"]) if lines else 0, FILM_STEPS * STEP_S)
+
+
+def run_charts(lines: Lines, kl_target: float | None = None) -> list[Chart]:
+    """Charts of a run of any stage; none before the first update.
+
+    Args:
+        lines: Metrics of each update, see `read_metrics`.
+        kl_target: Target of the KL of fine-tuning, a dashed line, in nats per decision; None = not drawn.
+    """
+    if not lines:
+        return []
+    if "credit_std" in lines[0]:  # a calibration has no updates that follow each other
+        return [_chart(lines, "Realism of the rollouts", "RMM", rmm="RMM")]
+    # Only fine-tuning with a reward logs the realism of its own rollouts.
+    return finetuning_charts(lines, kl_target) if "rmm" in lines[0] else imitation_charts(lines)
 
 
 def imitation_charts(lines: Lines) -> list[Chart]:

@@ -5,12 +5,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from itertools import repeat
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
-from rich.table import Table
 
 from rlftsim.evaluation.columns import COLUMNS, DRIFT_COLUMNS, Column, format_number
+from rlftsim.evaluation.compare import Comparison, paired_values
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.jobs.files import write_text
 from rlftsim.statistics import MeanInterval
@@ -62,6 +64,23 @@ class PairedComparison:
     verdict: str = ""
     """A sentence; empty = written from the interval."""
 
+    @classmethod
+    def of(cls, comparison: Comparison) -> "PairedComparison":
+        """The realism meta-metric of a comparison."""
+        difference = comparison["meta_metric"]
+        _, scores_a, scores_b = paired_values(comparison.a, comparison.b, "meta_metric")
+        return cls(
+            comparison.a.name,
+            comparison.b.name,
+            difference.difference,
+            difference.interval,
+            difference.p_value,
+            difference.count,
+            test=f"by {difference.num_clusters} street networks" if difference.num_clusters else "paired t-test",
+            differences=scores_b - scores_a,
+            verdict="" if math.isfinite(difference.p_value) else f"RMM: {difference.verdict}",
+        )
+
     @property
     def is_better(self) -> bool:
         """True if the whole interval lies above zero."""
@@ -99,6 +118,33 @@ class ChartGroup:
 
 
 @dataclass(frozen=True)
+class ScenarioRow:
+    """A scenario with the scores of several policies, and what there is to look at."""
+
+    scenario_id: str
+    scores: Sequence[float]
+    """RMM of each policy; NaN where a policy has none."""
+    lost: float
+    """What the judged policy lacks of the score of the log; NaN where either has none."""
+    change: float
+    """Gain of the judged policy over the first; NaN where either has none."""
+    pages: Sequence[str] = ()
+    """Address of the page that explains each score; empty = none."""
+    film: str = ""
+    """Address of a film; empty = none."""
+
+
+@dataclass(frozen=True)
+class ScenarioTable:
+    """Scenarios under a heading, a column of scores for each policy."""
+
+    title: str
+    names: Sequence[str]
+    rows: Sequence[ScenarioRow]
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class Report:
     """Contents of the page. Only the title is needed; empty contents are left out."""
 
@@ -108,7 +154,9 @@ class Report:
     rows: Sequence[ResultRow] = ()
     table_note: str = ""
     """For instance how many scenarios and rollouts the means are over."""
-    comparison: PairedComparison | None = None
+    comparisons: Sequence[PairedComparison] = ()
+    """The first is written large above all else."""
+    scenario_tables: Sequence[ScenarioTable] = ()
     chart_groups: Sequence[ChartGroup] = ()
     animations: Sequence[Animation] = ()
     animations_note: str = ""
@@ -135,7 +183,7 @@ def report_html(report: Report) -> str:
         f"<header><h1>{escape(report.title)}</h1>{lead}</header>",
         _tiles_html(report),
         _table_html("Results", report.rows, COLUMNS, f"{report.table_note} {_ERRORS} {_ARROWS_MEAN}"),
-        _comparison_html(report.comparison),
+        *(_comparison_html(comparison) for comparison in report.comparisons),
         _table_html("Drift from the log", report.rows, DRIFT_COLUMNS, f"{_DRIFT_MEANS} {_ERRORS}"),
     ]
     # 2. Pictures of it, and of the runs behind it.
@@ -143,6 +191,7 @@ def report_html(report: Report) -> str:
         note = f'<p class="muted">{escape(report.animations_note)}</p>' if report.animations_note else ""
         players = "\n".join(animation_html(animation) for animation in report.animations)
         sections.append(f"<h2>Scenarios in motion</h2>{note}{players}")
+    sections += [_scenarios_html(table) for table in report.scenario_tables if table.rows]
     for group in report.chart_groups:
         caption = f'<p class="muted">{escape(group.caption)}</p>' if group.caption else ""
         charts = "".join(chart_html(chart) for chart in group.charts)
@@ -157,20 +206,6 @@ def report_html(report: Report) -> str:
     return page_html(report.title, "\n".join(s for s in sections if s), extra_js=read_asset("chart.js"))
 
 
-def report_table(report: Report) -> Table:
-    """The result table, for `print_wide`."""
-    caption = f"{report.table_note} Mean ± standard error over scenarios.".lstrip() if report.rows else None
-    table = Table(title=report.title, caption=caption, title_justify="left", caption_justify="left")
-    table.add_column("policy", no_wrap=True)
-    columns = _measured_columns(report.rows, COLUMNS)
-    for column in columns:
-        table.add_column(column.label, justify="right")
-    for row in report.rows:
-        cells = [column.cell(row.estimates.get(column.source)) for column in columns]
-        table.add_row(row.name, *cells, style="bold" if row.emphasized else None)
-    return table
-
-
 def _measured_columns(rows: Sequence[ResultRow], columns: Sequence[Column]) -> list[Column]:
     return [column for column in columns if any(column.source in row.estimates for row in rows)]
 
@@ -182,9 +217,9 @@ def _sentence(text: str) -> str:
 
 def _tiles_html(report: Report) -> str:
     """The two compared means and the difference, large."""
-    comparison = report.comparison
-    if comparison is None:
+    if not report.comparisons:
         return ""
+    comparison = report.comparisons[0]
     # the two means only where the table has them in the same unit
     tiles = []
     by_name = {row.name: row.estimates.get("meta_metric") for row in report.rows}
@@ -256,9 +291,30 @@ def _cell_html(column: Column, estimate: MeanInterval | None) -> str:
     return f'<td title="95 % interval {low} to {high}">{column.text(estimate.mean)} {error}</td>'
 
 
-def _comparison_html(comparison: PairedComparison | None) -> str:
-    if comparison is None:
-        return ""
+def _scenarios_html(table: ScenarioTable) -> str:
+    """Scenarios by rows; a score is a link to the page that explains the score, where there is one."""
+    has_films = any(row.film for row in table.rows)
+    headings = (*table.names, "lost ↓", *(["change"] if len(table.names) > 1 else []), *(["film"] if has_films else []))
+    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in ("scenario", *headings))
+    body = []
+    for row in table.rows:
+        scores = [_link(page, format_number(score, 4)) for score, page in zip(row.scores, row.pages or repeat(""))]
+        change = [f"{row.change:+.4f}".replace("-", "−")] if len(table.names) > 1 else []
+        cells = [*scores, format_number(row.lost, 4), *change, *([_link(row.film, "film")] if has_films else [])]
+        texts = "".join(f"<td>{'–' if cell == 'nan' or cell == '+nan' else cell}</td>" for cell in cells)
+        body.append(f'<tr><th scope="row">{escape(row.scenario_id)}</th>{texts}</tr>')
+    note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
+    return (
+        f'<h2>{escape(table.title)}</h2>{note}<div class="card scroll long" tabindex="0"><table class="results">'
+        f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+    )
+
+
+def _link(address: str, text: str) -> str:
+    return f'<a href="{escape(quote(address))}">{text}</a>' if address else text
+
+
+def _comparison_html(comparison: PairedComparison) -> str:
     p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
     sign = "+" if comparison.mean_difference > 0 else ""
     tested = f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
     DownloadColumn,
@@ -20,6 +21,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
 from rlftsim.errors import printable, shorten
@@ -82,11 +84,16 @@ def print_lines(text: str) -> None:
 
 
 def print_wide(*tables: object) -> None:
-    """Print tables as wide as the terminal or as COLUMNS says, else `FILE_WIDTH` wide in files. Brackets in texts are
-    not markup."""
+    """Print tables as wide as the terminal or as COLUMNS says, else `FILE_WIDTH` wide in files. Nothing is cut: what
+    has no room goes on in the next line. Brackets in texts are not markup."""
     width = None if Console().is_terminal or "COLUMNS" in os.environ else FILE_WIDTH
     console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
+        for column in table.columns if isinstance(table, Table) else ():
+            column.overflow = "fold"
+            # a label that may not be broken would be cut where it does not fit beside the numbers
+            unlimited = console.options.update(max_width=10**6)
+            column.no_wrap &= Measurement.get(console, unlimited, table).minimum <= console.width
         console.print(table)
 
 

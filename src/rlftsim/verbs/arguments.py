@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 import tyro
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rlftsim.evaluation.drive_results import DriveResult
     from rlftsim.evaluation.results import Evaluation
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     GoalPoints: TypeAlias = Goals | PointById | Mapping[str, PointById] | str | os.PathLike[str]
     Simulated: TypeAlias = Rollouts | str | os.PathLike[str]
     Result: TypeAlias = Evaluation | DriveResult | str | os.PathLike[str]
+    Results: TypeAlias = Sequence[Result]
+    Models: TypeAlias = Sequence[Model]
+    Runs: TypeAlias = Sequence[str | os.PathLike[str]]
 else:
     from pathlib import Path
 
@@ -42,6 +45,8 @@ else:
     RecipeOption = Annotated[Any, Annotated[str, tyro.conf.arg(metavar="RECIPE")]]
     OnUpdate = Any
     File = Settings = GoalPoints = Simulated = Result = Annotated[Any, Path]
+    Results = Annotated[Any, tuple[Path, ...]]
+    Models = Runs = Annotated[Any, tuple[str, ...]]
     ScoreMetric = Annotated[Any, Literal["2025", "2024", "2024_original_code", "2023"]]
 
 Device = Literal["auto", "cpu", "cuda"]

@@ -171,9 +171,13 @@ VERBS = {
         Command("evaluate:evaluate", ("policy",), ("out",), MODEL, "print_evaluation", has_shares=True),
     ),
     "compare": Verb(
-        "compare two evaluations scenario by scenario",
-        Command("compare:compare", ("a", "b"), names={"a": "FIRST", "b": "SECOND"}, show="print_comparison"),
+        "compare evaluations scenario by scenario",
+        Command("compare:compare", ("a", "b", "others"), names={"a": "FIRST", "b": "SECOND"}, show="print_comparison"),
         starts_anew=True,
+    ),
+    "report": Verb(
+        "write a page that compares evaluated models, with films of the worst scenarios",
+        Command("report:report", ("results",), names={"runs": "run"}, show="print_report"),
     ),
     "submit": Verb(
         "build an archive for the Sim Agents leaderboard, or check one before it is uploaded",

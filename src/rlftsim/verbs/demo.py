@@ -32,7 +32,9 @@ def demo(out: Path | None = None, processes: int | Literal["auto"] = "auto", qui
         (smart_demo_quick() if quick else smart_demo_rlftsim()).with_processes(processes),
         pack_path(),
         replace(evaluation, num_rollouts=8, limit=8) if quick else evaluation,
-        num_scenes=2 if quick else 3,
+        num_played=2 if quick else 3,
+        num_listed=1 if quick else 3,
+        is_quick=quick,
     )
     result = run_demo(config, out or Path("runs/demo-quick" if quick else "runs/demo"))
     print_line(f"report: {result.report}")

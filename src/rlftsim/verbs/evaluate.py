@@ -12,12 +12,11 @@ from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
-from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
-from rlftsim.verbs.inputs import to_policy, to_sampling
+from rlftsim.verbs.inputs import find_policy_name, to_policy, to_sampling
 
 
 def evaluate(
@@ -49,8 +48,8 @@ def evaluate(
             ceiling). In Python also a policy.
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package. In Python also an
             opened data set or scenarios in any other form.
-        name: Name of the table row and of the file. Left out: the model's name; of a policy in memory its class with
-            the beginning of its fingerprint.
+        name: Name of the table row and of the file. Left out: the model's name; of a policy that was not loaded, or
+            was changed since, its class with the beginning of its fingerprint.
         out: Folder for the results. In Python they may be in memory alone.
         num_rollouts: Rollouts per scenario; the official metric is defined for 32.
         seed: Seed of all randomness. The same seed gives the same scores.
@@ -89,7 +88,7 @@ def evaluate(
         model = load_policy_or_oracle(policy, device)
     else:
         model = to_policy(policy)
-        name = name or f"{type(model).__name__}-{fingerprint_policy(model)[:8]}"
+        name = name or find_policy_name(model)
     model = with_guidance(model, guidance_scale)
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)

@@ -3,19 +3,25 @@
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
 
 from rlftsim.errors import ConfigError, in_short
+from rlftsim.evaluation.evaluate import evaluation_name
 from rlftsim.policies import registry
 from rlftsim.policies.registry import Device
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import recipe_by_name
+from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import Name, open_dataset, to_scenarios
+
+LOADED = "_loaded"
+"""Attribute of a loaded policy: its name, and its fingerprint then."""
 
 
 def load_dataset(name: Name, split: str | None = None) -> ScenarioDataset:
@@ -45,7 +51,27 @@ def load_policy(name: Name, device: Device = "auto") -> Policy:
         ConfigError: Neither a registered name nor a folder, or no such device.
         CheckpointError: A folder that is damaged or holds something else.
     """
-    return registry.load_policy(validate_name(name, "policy", "constant_velocity"), device)
+    policy = registry.load_policy(validate_name(name, "policy", "constant_velocity"), device)
+    remember_name(policy, name)
+    return policy
+
+
+def remember_name(policy: Policy, name: Name) -> None:
+    """Keep the name that a policy can be loaded by, for `find_policy_name`.
+
+    Args:
+        policy: Policy as it is loaded.
+        name: Folder or registered name.
+    """
+    with suppress(AttributeError):  # some classes take no further attributes
+        setattr(policy, LOADED, (evaluation_name(name), fingerprint_policy(policy)))
+
+
+def find_policy_name(policy: Policy) -> str:
+    """Name that a policy was loaded by; of any other, and of one that changed since, class and fingerprint."""
+    fingerprint = fingerprint_policy(policy)
+    name, loaded_fingerprint = getattr(policy, LOADED, ("", ""))
+    return name if fingerprint == loaded_fingerprint else f"{type(policy).__name__}-{fingerprint[:8]}"
 
 
 def validate_name(name: Any, subject: str, example: str) -> Any:
@@ -84,6 +110,24 @@ def to_policy(policy: Any, device: Device = "auto") -> Policy:
     if not isinstance(policy, Policy):
         raise ConfigError(f"{in_short(policy)} is not a policy: hand over one, or a name for rs.load_policy.")
     return policy
+
+
+def read_result(result: Any, result_type: Any) -> Any:
+    """A result as it is, or from its file.
+
+    Args:
+        result: Evaluation or result of a drive, or path of a file.
+        result_type: Class of the result, `Evaluation` or `DriveResult`.
+
+    Raises:
+        ConfigError: Neither a result of this class nor a path.
+        DataError: No such file, or a file of something else.
+    """
+    if isinstance(result, str | os.PathLike):
+        return result_type.read(result)
+    if not isinstance(result, result_type):
+        raise ConfigError(f"{type(result).__name__}: not an evaluation: hand over one of rs.evaluate, or its file.")
+    return result
 
 
 def to_batch(scenarios: Any, device: torch.device | str = "cpu") -> ScenarioBatch:

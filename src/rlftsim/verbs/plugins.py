@@ -4,7 +4,7 @@ import importlib
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 
-from rich.table import Column, Table
+from rich.table import Table
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import print_line, print_wide
@@ -86,7 +86,7 @@ def plugins() -> int:
         print_line(f"no installed package has an entry point in {', '.join(POINTS)}.")
         return 0
     headings = ("group", "name", "package", "version", "object", "state")
-    table = Table(*(Column(heading, overflow="fold") for heading in headings))
+    table = Table(*headings)
     for plug_in in plug_ins:
         state = "fails" if plug_in.problem else "works"
         table.add_row(plug_in.group, plug_in.name, plug_in.package, plug_in.version, plug_in.value, state)

@@ -145,7 +145,7 @@ def print_runs(training_runs: list[RunSummary]) -> None:
     names = _shorten_names([run.folder for run in training_runs])
     table = Table()
     for heading in ("run", "model", "updates", "metric", "last", "best", "at update"):
-        table.add_column(heading, justify="left" if heading in ("run", "model", "metric") else "right", overflow="fold")
+        table.add_column(heading, justify="left" if heading in ("run", "model", "metric") else "right")
     for name, run in zip(names, training_runs):
         update, best = run.best or (NO_VALUE, None)
         measure = run.measure or NO_VALUE

@@ -24,7 +24,7 @@ from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
-from rlftsim.verbs.inputs import to_policy
+from rlftsim.verbs.inputs import remember_name, to_policy
 from rlftsim.verbs.runs import SEED_FOLDER, print_runs
 from rlftsim.verbs.runs import runs as list_runs
 
@@ -86,6 +86,8 @@ def train(
     if out is not None and is_first_process():
         with suppress(RlftsimError, OSError):  # a picture is no reason to lose a model
             film_model(Path(out), policy, (options["held_out"] or scenarios)[0])
+    if out is not None:
+        remember_name(policy, out)
     return policy
 
 

@@ -2,7 +2,9 @@
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -29,7 +31,7 @@ def to_film(
     """Write a film of an animation's first rollouts, from the current step on, in real time.
 
     Args:
-        path: File to write, .mp4 (H.264) or .webp (plays wherever pictures are shown); no half-written file is left.
+        path: File to write, .mp4 (H.264), or .webp or .gif (play wherever pictures are shown); never half a file.
         animation: Scene and panels, each with the motion of the agents.
         steps_per_frame: Number of steps of 0.1 s between frames; 2 halves the size of the file.
         dots_per_inch: Resolution; 110 makes a panel 440 pixels wide.
@@ -39,14 +41,15 @@ def to_film(
         DataError: The file cannot be written.
     """
     path = Path(path)
-    if path.suffix not in WRITERS:
+    write = WRITERS.get(path.suffix.lower())
+    if write is None:
         raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
     # The last frame stays for a while, or the end could not be seen before a player starts again.
     camera, rate = Camera(animation, dots_per_inch), STEPS_PER_SECOND / steps_per_frame
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
     frames = [camera.frame(animation.panels, step) for step in range(CURRENT_STEP, num_steps, steps_per_frame)]
     frames += frames[-1:] * round(HOLD_AT_END_S * rate)
-    write_atomically(path, lambda temporary: WRITERS[path.suffix](temporary, frames, rate))
+    write_atomically(path, lambda temporary: write(temporary, frames, rate))
 
 
 class Camera:
@@ -104,12 +107,15 @@ def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> Non
     writer.close()
 
 
-def _write_webp(path: Path, frames: list[Frame], frames_per_second: float) -> None:
+def _write_pictures(path: Path, frames: list[Frame], frames_per_second: float, **options: Any) -> None:
     first, *later = (Image.fromarray(frame) for frame in frames)
-    first.save(
-        path, format="WEBP", save_all=True, append_images=later, duration=round(1000 / frames_per_second), loop=0,
-        quality=60, method=4,
-    )  # fmt: skip
+    duration = round(1000 / frames_per_second)
+    first.save(path, save_all=True, append_images=later, duration=duration, loop=0, **options)
 
 
-WRITERS: dict[str, Callable[[Path, list[Frame], float], None]] = {".mp4": _write_mp4, ".webp": _write_webp}
+WRITERS: dict[str, Callable[[Path, list[Frame], float], None]] = {
+    ".mp4": _write_mp4,
+    ".webp": partial(_write_pictures, format="WEBP", quality=60, method=4),
+    ".gif": partial(_write_pictures, format="GIF"),
+}
+"""Function that writes a film, by the ending of the file."""

@@ -16,6 +16,7 @@ from rlftsim.jobs.files import write_text
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, register_html
+from rlftsim.viewer.film import WRITERS, to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
 
@@ -25,11 +26,13 @@ MAX_SCENARIOS = 3
 """Scenarios of a cell."""
 FRAME_HEIGHT = 660
 """Pixels that one scenario takes."""
-FRAME_CSS = (
-    "body { background: none } main { padding: 0; max-width: none } figure.player { margin: 0 0 8px }"
-    ".panels { grid-template-columns: repeat(auto-fit, minmax(min(100%, 260px), 420px)) }"
-)
-"""Panels stay small enough for the frame, whatever the width of the cell."""
+FRAME_CSS = """
+body { background: none } main { padding: 0; max-width: none } figure.player { margin: 0 0 8px }
+.panel canvas { max-height: 420px }
+@media (max-width: 1000px) { .panel canvas { aspect-ratio: 16 / 10 } }
+.controls { position: sticky; bottom: 0; background: var(--surface); padding: 8px 0; margin-top: 4px; z-index: 1 }
+"""
+"""Panels are low enough for the frame, and the controls stay inside, whatever the width of the cell."""
 
 
 class Cell:
@@ -38,15 +41,31 @@ class Cell:
     Args:
         page: HTML of a whole self-contained page.
         height: Height of the frame in pixels; a higher page scrolls.
+        animations: Scenes of the page, for films.
     """
 
-    def __init__(self, page: str, height: int = FRAME_HEIGHT) -> None:
+    def __init__(self, page: str, height: int = FRAME_HEIGHT, animations: Sequence[Animation] = ()) -> None:
         self.page = page
         self.height = height
+        self.animations = animations
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page, which opens in any browser without a network."""
-        write_text(Path(path), self.page)
+        """Write the page, which opens in any browser without a network, or a film of the first scenario.
+
+        Args:
+            path: File that ends in .html, or for a film in .mp4, .webp or .gif.
+
+        Raises:
+            ConfigError: Another ending.
+            DataError: The file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() in (".html", ".htm"):
+            write_text(path, self.page)
+        elif path.suffix.lower() in WRITERS and self.animations:
+            to_film(path, self.animations[0])
+        else:
+            raise ConfigError(f"{path}: a page ends in .html, a film in {', '.join(WRITERS)}: choose one of these.")
 
     def __repr__(self) -> str:
         return f"Cell({len(self.page) / 1000:.0f} kB page: plays in a notebook, .save('page.html') writes it)"
@@ -101,7 +120,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
             "rollouts 2", ...
 
     Returns:
-        A value that a notebook displays; `save(path)` writes the page.
+        A value that a notebook displays; `save("page.html")` writes the page, `save("film.mp4")` a film.
 
     Raises:
         ConfigError: Rollouts of other scenarios, more titles than rollouts, or no scenario.
@@ -116,7 +135,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
     names = [*titles, *numbered[len(titles) :]]
     scenarios = to_scenarios(scenario)
     # One figure a scenario: the log, then one panel for each argument of rollouts.
-    figures = []
+    animations = []
     for row in range(min(len(scenarios), MAX_SCENARIOS)):
         log = scenarios[row]
         scene = build_scene(log)
@@ -131,9 +150,37 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
             batch_row = row if simulated.provenance is None else simulated.find_row(log.scenario_id)
             motion = rollout_trajectories(log, simulated, row=batch_row, max_rollouts=MAX_ROLLOUTS)
             panels.append(Panel(name, motion.with_overlaps(scene.agents)))
-        figures.append(animation_html(Animation(f"Scenario {log.scenario_id}", scene, panels)))
-    page = page_html(f"Scenario {scenarios[0].scenario_id}", "\n".join(figures), extra_css=FRAME_CSS)
-    return Cell(page, FRAME_HEIGHT * len(figures))
+        animations.append(Animation(f"Scenario {log.scenario_id}", scene, panels))
+    figures = "\n".join(map(animation_html, animations))
+    page = page_html(f"Scenario {scenarios[0].scenario_id}", figures, extra_css=FRAME_CSS)
+    return Cell(page, FRAME_HEIGHT * len(animations), animations)
+
+
+def film(
+    scenario: AnyScenarios,
+    rollouts: Rollouts | Sequence[Rollouts],
+    path: str | os.PathLike[str],
+    *,
+    titles: str | Sequence[str] = (),
+) -> Path:
+    """Write a film of a scenario: the log beside the first rollout of each model, in real time. Returns the file.
+
+    Args:
+        scenario: A scenario; of several the first is filmed.
+        rollouts: Rollouts of the same scenarios; several in a list have a panel each.
+        path: File that ends in .mp4, .webp or .gif.
+        titles: Titles of the panels with rollouts, as for `show`.
+
+    Raises:
+        ConfigError: Another ending, or what `show` refuses.
+        DataError: What `show` refuses, or a file that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in WRITERS:
+        raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
+    arguments = rollouts if isinstance(rollouts, list | tuple) else [rollouts]
+    show(scenario, *arguments, titles=titles).save(path)
+    return path
 
 
 def _show_rollouts(rollouts: Rollouts) -> str | None:
