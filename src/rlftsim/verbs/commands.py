@@ -149,6 +149,11 @@ VERBS = {
         "roll out scenarios with a model",
         Command("simulate:simulate", ("policy",), ("out",), {**MODEL, **DATA}, "print_rollouts", has_shares=True),
     ),
+    "export": Verb(
+        "write stored rollouts as files that other programs read",
+        Command("export:export", ("exporter", "rollouts", "out"), ("scenarios",), {"exporter": "FORMAT"}),
+        starts_anew=True,
+    ),
     "drive": Verb("let a planner drive among simulated traffic, and score both", Command("drive:drive", ("planner",))),
     "failures": Verb(
         "estimate how often a planner fails in realistic traffic, and show how",
