@@ -80,6 +80,7 @@ def finetune(
     processes: Processes = None,
     split: str = "training",
     validation_split: str | None = None,
+    tracker: str = "tensorboard",
 ) -> Policy:
     """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), by CAT-K, by RoaD or by
     calibration.
@@ -120,6 +121,8 @@ def finetune(
         split: Split of the data set to train on.
         validation_split: With rlft, catk and road: split to validate on in closed loop, see
             --finetune.validation.every. Left out: "tune", the part of "validation" that is not of the exam.
+        tracker: Programs that show the run while it trains, with commas between: tensorboard, wandb, mlflow, trackio,
+            those of other packages, or module:Class. metrics.jsonl is always written. Empty: none.
 
     Returns:
         The fine-tuned policy, ready to simulate.
@@ -151,7 +154,7 @@ def finetune(
         learner = with_conditioning(learner, conditioning, settings.seed, name=name)
     card = write_card(f"fine-tuned ({describe_method(settings)}{conditioning})", training, policy)
     learner = prepare_policy(learner, settings)
-    return train(learner, training, out, settings, held_out=held_out, card=card, device=device)
+    return train(learner, training, out, settings, held_out=held_out, card=card, device=device, tracker=tracker)
 
 
 def find_section(method: str) -> str:

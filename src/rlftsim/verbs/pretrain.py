@@ -81,6 +81,7 @@ def pretrain(
     processes: Processes = None,
     split: str = "training",
     validation_split: str | None = None,
+    tracker: str = "tensorboard",
 ) -> Policy:
     """Train a model on logged tracks (SMART: to predict the next motion token of every agent), from fresh weights or
     further (--init-from).
@@ -113,6 +114,8 @@ def pretrain(
         split: Split of the data set to train on.
         validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "tune", the
             part of "validation" that is not of the exam.
+        tracker: Programs that show the run while it trains, with commas between: tensorboard, wandb, mlflow, trackio,
+            those of other packages, or module:Class. metrics.jsonl is always written. Empty: none.
 
     Returns:
         The pre-trained policy, ready to simulate; a policy that was handed over stays as it is.
@@ -153,7 +156,7 @@ def pretrain(
             replaced = () if tokens is None else (tokens, keep_tokens)
             learner = like.train_further(learner, *replaced)  # pyright: ignore[reportArgumentType]
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
-    return train(learner, training, out, settings, held_out=validation, card=card, device=device)
+    return train(learner, training, out, settings, held_out=validation, card=card, device=device, tracker=tracker)
 
 
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:

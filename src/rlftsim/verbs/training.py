@@ -22,6 +22,7 @@ from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
+from rlftsim.training.trackers import find_tracker
 from rlftsim.verbs.inputs import to_policy
 
 VALIDATION = "validation"
@@ -55,6 +56,7 @@ def train(
     held_out: Scenarios | None,
     card: str,
     device: Any,
+    tracker: str,
 ) -> Any:
     """The policy, trained in place and ready to simulate; the pictures of its run are drawn.
 
@@ -66,16 +68,23 @@ def train(
         held_out: Scenarios for validation; None = no validation.
         card: README of the model folder.
         device: Device of the result.
+        tracker: Names of trackers, with commas between.
+
+    Raises:
+        ConfigError: An unknown tracker, or see `train_policy`.
     """
+    trackers = [name for name in tracker.split(",") if name]
+    for name in trackers:  # a mistyped one is refused before any work
+        find_tracker(name)
     # Weights of a loaded policy are frozen; each method freezes again what it does not train.
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)
     if out is None:
         with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
-            train_policy(policy, scenarios, folder, settings, held_out=held_out, card=card)
+            train_policy(policy, scenarios, folder, settings, held_out=held_out, card=card, trackers=trackers)
     else:
         with _learning_curve(Path(out)):
-            model = train_policy(policy, scenarios, out, settings, held_out=held_out, card=card)
+            model = train_policy(policy, scenarios, out, settings, held_out=held_out, card=card, trackers=trackers)
         if is_first_process():
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
