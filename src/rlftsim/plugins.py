@@ -1,7 +1,7 @@
 """Extension points: names that other packages and notebooks can add to, by one mechanism for every kind of thing.
 
-Rewards, policies, features, training methods, data sources, recipes, experiments, planners and exporters are each an
-`ExtensionPoint`. A name is looked for
+Rewards, policies, features, training methods, data sources, recipes, experiments, planners, trackers and exporters are
+each an `ExtensionPoint`. A name is looked for
 
 1. among what was registered by a decorator, in a notebook or in an imported module,
 2. among what this package ships, which is imported on first use,

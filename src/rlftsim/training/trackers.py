@@ -197,6 +197,7 @@ TRACKERS: ExtensionPoint[Callable[[], Tracker]] = ExtensionPoint(
         "mlflow": "rlftsim.training.trackers:MlflowTracker",
         "trackio": "rlftsim.training.trackers:TrackioTracker",
     },
+    use=lambda name: find_tracker(name),
 )
 """Name -> class."""
 
@@ -211,17 +212,21 @@ def find_tracker(name: str) -> Callable[[], Tracker]:
     """Class of a tracker, by its name or as "package.module:Class".
 
     Raises:
-        ConfigError: Unknown, or not importable.
+        ConfigError: Unknown, not importable, or without a method of a tracker.
     """
     module, colon, attribute = name.partition(":")
-    if not colon:
-        return TRACKERS.get(name)
     try:
-        return getattr(importlib.import_module(module), attribute)
+        tracker = getattr(importlib.import_module(module), attribute) if colon else TRACKERS.get(name)
+    except ConfigError:
+        raise
     except (Exception, SystemExit) as error:  # a file of others may fail in any way
         raise ConfigError(
             f"tracker {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
         ) from error
+    missing = [method for method in ("start", "log", "artifact", "finish") if not hasattr(tracker, method)]
+    if missing:
+        raise ConfigError(f"tracker {name!r} has no {', '.join(missing)}: see docs/trackers.md.")
+    return tracker
 
 
 class RunTrackers:

@@ -2,6 +2,7 @@
 
 import copy
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -74,6 +75,8 @@ def train(
         ConfigError: An unknown tracker, or see `train_policy`.
     """
     trackers = [name for name in tracker.split(",") if name]
+    if ":" in tracker:  # a class may be in the folder that the command is called in
+        sys.path.insert(0, "")
     for name in trackers:  # a mistyped one is refused before any work
         find_tracker(name)
     # Weights of a loaded policy are frozen; each method freezes again what it does not train.
