@@ -152,7 +152,7 @@ def test_a_mistyped_tracker_is_refused_before_any_work(tmp_path, capsys, monkeyp
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match=r"tracker 'no_such:Thing' cannot be imported .*name package.module:Class"):
         find_tracker("no_such:Thing")
-    (tmp_path / "trackers_of_mine.py").write_text("class Mine:\n    pass\n")
+    (tmp_path / "trackers_of_mine.py").write_text("class Mine:\n    start = log = artifact = finish = print\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert find_tracker("trackers_of_mine:Mine").__name__ == "Mine"
 

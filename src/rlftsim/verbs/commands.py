@@ -126,14 +126,15 @@ VERBS = {
         Command("model:list_models"), starts_anew=True,
     ),
     "model": Verb(
-        "average models; import a checkpoint of the public CAT-K code, or export one",
+        "average or upload models; import a checkpoint of the public CAT-K code, or export one",
         {
             "show": Command("model:show_model", ("model",)),
             "average": Command("model:average_models", ("models",)),
             "import": Command("model:import_model", ("checkpoint",), names={"format": "from"}),
             "export": Command("model:export_model", ("model", "out"), names={"format": "to"}),
+            "push": Command("model:push_model", ("model", "url")),
         },
-        "Show or average models, import a checkpoint of the public CAT-K code, or export a model to it.",
+        "Show, average or upload models, import a checkpoint of the public CAT-K code, or export a model to it.",
         starts_anew=True,
     ),
     "goals": Verb(

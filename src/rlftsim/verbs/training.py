@@ -15,6 +15,7 @@ from torch import nn
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.learning_curve import write_calibration_picture, write_learning_curve
 from rlftsim.jobs.progress import log, print_line
+from rlftsim.policies.hub import pin_model
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.card import append_cards, model_card
 from rlftsim.rollout.policy import Policy, get_device
@@ -112,7 +113,7 @@ def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str
         scenarios: Training scenarios.
         start: Policy that training started from, or its name; None = fresh weights.
     """
-    name = start if isinstance(start, str | os.PathLike) else None
+    name = pin_model(start) if isinstance(start, str | os.PathLike) else None
     if start is not None:
         description = f"{description} from {name or type(start).__name__}"
     if isinstance(scenarios, ScenarioDataset):
