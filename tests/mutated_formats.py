@@ -21,6 +21,7 @@ import rlftsim as rs
 import scenes
 import tiny
 from av2_files import write_av2
+from gpudrive_files import write_file
 from rlftsim.cli.main import main, parse
 from rlftsim.envs import EgoEnv
 from rlftsim.errors import RlftsimError
@@ -140,6 +141,12 @@ def make_tables(folder: Path) -> None:
     lights = [{"scenario_id": "one", "step": s, "lane_id": 1, "state": "stop" if s < 5 else "go"} for s in range(91)]
     row = [{"scenario_id": "one", "ego_id": 7, "map_id": "m", "step_s": 0.1, "license": "mine"}]
     write_tables(folder / "tables", None, row, shared, lanes=lanes, lights=lights)
+
+
+def gpudrive_format(form: str) -> Format:
+    """A form of GPUDrive and Nocturne."""
+    make = lambda folder: write_file(folder / "scenes", build_message("one", num_tracks=3), form)  # noqa: E731
+    return Format({"scenes/*": "json"}, make, convert(Path("scenes"), "--from", "gpudrive"), ("scenario.gpudrive",))
 
 
 def read_set(folder: Path) -> None:
@@ -515,6 +522,9 @@ FORMATS: Mapping[str, Format] = {
     "tables": Format(
         {"tables/*": "parquet"}, make_tables, convert(Path("tables"), "--from", "tables"), ("scenario.tables",)
     ),
+    "GPUDrive": gpudrive_format("present"),
+    "early GPUDrive": gpudrive_format("early"),
+    "Nocturne": gpudrive_format("Nocturne"),
     "data set": Format(
         {"set/manifest.json": "json", "set/index.parquet": "parquet"}, *(write_set, read_set), ("scenario.dataset",)
     ),

@@ -17,6 +17,7 @@ import rlftsim as rs
 import scenes
 import third_party
 from av2_files import write_av2
+from gpudrive_files import write_file
 from made_up import CPU, TINY
 from rlftsim.policies.registry import POLICIES
 from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk_vocabulary
@@ -82,6 +83,8 @@ def write_things(folder: Path) -> None:
     for place in ("av2/val", "argoverse2/val"):
         write_av2(folder / place, scenes.straight_road("0a1b2c3d"))
     write_tables(folder / "recordings")
+    for number in range(2):
+        write_file(folder / "GPUDrive_mini" / "validation", build_message(f"g{number}"))
     (folder / "logs").mkdir()
     (folder / "logs" / "monday.mylog").write_text("one\n")
     # 2. models

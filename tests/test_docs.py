@@ -30,6 +30,7 @@ TAKEN_FOR_GRANTED = {
     ),
     "data.md": ("womd", "av2", "recordings", "logs"),
     "goals.md": ("runs",),
+    "gpudrive.md": ("GPUDrive_mini",),
     "machines.md": ("data", "runs"),
     "rollout_formats.md": ("data", "rollouts", "predictions", "messages"),
     "start.md": ("womd", "argoverse2"),

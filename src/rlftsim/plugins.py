@@ -1,7 +1,7 @@
 """Extension points: names that other packages and notebooks can add to, by one mechanism for every kind of thing.
 
-Rewards, policies, features, training methods, data sources, recipes, experiments, planners and exporters are each an
-`ExtensionPoint`. A name is looked for
+Rewards, policies, features, training methods, data sources, recipes, experiments, planners, trackers and exporters are
+each an `ExtensionPoint`. A name is looked for
 
 1. among what was registered by a decorator, in a notebook or in an imported module,
 2. among what this package ships, which is imported on first use,
@@ -17,11 +17,12 @@ its names; `rlftsim plugins` says why.
 
 import difflib
 import importlib
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from rlftsim.errors import ConfigError, in_short, locate_error
 
@@ -181,3 +182,26 @@ class ExtensionPoint(Generic[Value]):
 def is_ours(value: object) -> bool:
     """True for functions and classes that are defined in this package."""
     return (getattr(value, "__module__", None) or "").partition(".")[0] == "rlftsim"
+
+
+def import_object(title: str, location: str) -> Any:
+    """Object of an importable module, or of a file in the current folder, as `python -m` finds modules.
+
+    Args:
+        title: Words for the object in messages, such as "planner".
+        location: Module and name, "package.module:Class".
+
+    Raises:
+        ConfigError: No module, or one that cannot be imported or lacks the name.
+    """
+    module, _, attribute = location.partition(":")
+    if not module or module.startswith("."):
+        raise ConfigError(f"{title} {location!r} names no module: write package.module:Class.")
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (Exception, SystemExit) as error:  # a file of others may fail in any way
+        raise ConfigError(
+            f"{title} {location!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
+        ) from error

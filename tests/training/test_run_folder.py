@@ -15,7 +15,8 @@ from rlftsim.rollout.edge_scenes import move_scenario
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.training.board import write_film
 from rlftsim.training.config import FinetuneConfig, KlConfig
-from rlftsim.training.run_folder import RunFolder, board_tag, describe_inputs, read_metrics, to_plain
+from rlftsim.training.run_folder import RunFolder, describe_inputs, read_metrics, to_plain
+from rlftsim.training.trackers import board_tag
 
 
 def test_the_folder_holds_the_resolved_configuration_and_the_environment(tmp_path):
@@ -58,13 +59,13 @@ def test_metrics_of_updates_that_are_done_again_are_dropped(tmp_path):
     run.continue_from(0)
     for update in range(1, 6):
         run.log(update, {"rmm": update / 10})
-    run.close()
+    run.finish_trackers("finished")
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"update": 6, "rm')  # a kill cut this line short
     again = RunFolder(tmp_path, FinetuneConfig())
     again.continue_from(3)
     again.log(4, {"rmm": 9.0})
-    again.close()
+    again.finish_trackers("finished")
     assert [(line["update"], line["rmm"]) for line in read_metrics(tmp_path)] == [
         (1, 0.1),
         (2, 0.2),
@@ -85,7 +86,7 @@ def test_a_process_that_does_not_write_leaves_nothing(tmp_path):
     run = RunFolder(tmp_path / "run", FinetuneConfig(), writes=False)
     run.continue_from(0)
     run.log(1, {"rmm": 0.5})
-    run.close()
+    run.finish_trackers("finished")
     assert not (tmp_path / "run").exists()
     assert read_metrics(tmp_path / "run") == []
 

@@ -31,7 +31,7 @@ OVERVIEW = "\n".join(
     ]
 )
 SIGNALLED = 128
-"""Added to the number of the signal that ended the command: 130 = Ctrl-C, 143 = SIGTERM, 129 = SIGHUP, 138 = SIGUSR1."""
+"""Added to the number of the signal that ended a command: 129 = SIGHUP, 130 = Ctrl-C, 138 = SIGUSR1, 143 = SIGTERM."""
 USER_MISTAKE = 2
 
 

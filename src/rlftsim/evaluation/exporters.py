@@ -34,7 +34,11 @@ Exporter = Callable[[Scenario, SimulatedStates, Path], Path]
 EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
     "exporter",
     "rlftsim.exporters",
-    {"page": "rlftsim.evaluation.exporters:write_player", "film": "rlftsim.evaluation.exporters:write_film"},
+    {
+        "page": "rlftsim.evaluation.exporters:write_player",
+        "film": "rlftsim.evaluation.exporters:write_film",
+        "gpudrive": "rlftsim.evaluation.gpudrive_files:write_gpudrive",
+    },
     use=lambda name: exporter_by_name(name),
 )
 """Name -> function."""
@@ -138,7 +142,7 @@ def report_rollouts(
         if not (entries or picture):
             continue
         scenario = dataset.by_id(scenario_id)
-        states = _read_rollouts(folder, scenario)
+        states = read_rollouts(_entry(folder, scenario_id), scenario)
         outcomes += [
             (entry, measure_outcome(states.simulated_path(entry.agent_id), (entry.x, entry.y))) for entry in entries
         ]
@@ -150,19 +154,27 @@ def report_rollouts(
     for path in pictures:
         print_line(path)
     for scenario in map(dataset.by_id, scenario_ids if exporters else ()):
-        states = _read_rollouts(folder, scenario)
+        states = read_rollouts(_entry(folder, scenario.scenario_id), scenario)
         for write in exporters:
             print_line(write(scenario, states, folder))
 
 
-def _read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:
-    """Rollouts of a scenario in a folder that `rlftsim simulate` wrote.
+def _entry(folder: Path, scenario_id: str) -> RolloutEntry:
+    """Rollouts of a scenario in a folder that `rlftsim simulate` wrote."""
+    return RolloutEntry(scenario_id, folder / f"{scenario_id}.npz", "npz")
+
+
+def read_rollouts(entry: RolloutEntry, scenario: Scenario) -> SimulatedStates:
+    """Rollouts of a scenario, with all agents of the scenario.
+
+    Args:
+        entry: Location of the rollouts.
+        scenario: Scenario that was simulated.
 
     Raises:
         DataError: Damaged file, or one without the agents of the scenario.
     """
     # Files of an earlier call may be damaged or of an older data set.
-    entry = RolloutEntry(scenario.scenario_id, folder / f"{scenario.scenario_id}.npz", "npz")
     way_out = "remove it, then run the same command again."
     try:
         states = read_states(entry)

@@ -10,9 +10,12 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable
 from errno import ESPIPE
+from itertools import chain
 from os import PathLike, fspath, fstat, stat
 from stat import S_ISFIFO, S_ISSOCK
 from typing import Any
+from zlib import decompressobj
+from zlib import error as ZlibError
 
 from rlftsim.errors import DataError, RlftsimError, printable
 
@@ -29,6 +32,7 @@ LONGEST_NAME = 40
 """Characters of a name that a message repeats."""
 MAX_NAME_BYTES = 200
 """Bytes of a text that becomes a file name; file systems take names of 255 bytes, and a suffix follows."""
+_GZIP = b"\x1f\x8b"
 _TYPE_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 
 
@@ -41,7 +45,7 @@ def read_json(
     error: type[RlftsimError] = DataError,
     missing: str = "",
 ) -> Any:
-    """Value of a JSON file in UTF-8, with or without a mark in front.
+    """Value of a JSON file in UTF-8, with or without a mark in front, perhaps compressed by gzip.
 
     Args:
         path: JSON file of at most `MAX_TEXT_BYTES`.
@@ -98,11 +102,13 @@ def parse_json(
         try:
             value = json.loads(
                 decoded,
-                parse_float=parse_float,
+                parse_float=None if allow_nan else parse_float,
                 parse_constant=parse_float,
                 parse_int=parse_int,
-                object_pairs_hook=_build_object,
             )
+            # every name has a colon; more of them are in texts, or behind a name that is written twice
+            if _count_names(value) < decoded.count(":"):
+                json.loads(decoded, object_pairs_hook=_build_object)
             # escapes such as \ud800 are halves of characters, which no file, terminal or picture can hold
             if "\\u" in decoded:
                 json.dumps(value, ensure_ascii=False).encode()
@@ -133,7 +139,9 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
         if _LONG_DOTTED_KEY.search(decoded):  # tomllib takes a time that grows with the square of a key's length
             raise RecursionError
         try:
-            return tomllib.loads(decoded)
+            value = tomllib.loads(decoded)
+            _count_names(value)
+            return value
         except tomllib.TOMLDecodeError as problem:
             raise ValueError(f"not TOML: {problem}") from None
 
@@ -171,11 +179,13 @@ def _read_bytes(
         with open(path, "rb") as file:
             # a device or a pipe has no size, so the bytes that come are counted, too
             text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None
+        if text and text.startswith(_GZIP):
+            text = decompressobj(wbits=31).decompress(text, limit + 1)
     except FileNotFoundError:
         if missing:
             raise error(missing) from None
         raise
-    except (OSError, ValueError) as problem:  # the latter: a null byte in the name
+    except (OSError, ValueError, ZlibError) as problem:  # the second: a null byte in the name
         raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None
     if text is None or len(text) > limit:
         raise error(f"{path}: larger than {limit >> 20} MiB, which no such file is: {remedy}.")
@@ -187,7 +197,6 @@ def _parse(text: str | bytes, parse: Callable[[str], Any], source: str, remedy: 
     try:
         decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
         value = parse(decoded)
-        _check_depth(value)
     except UnicodeDecodeError:
         cause = "not text in UTF-8"
     except UnicodeEncodeError as problem:
@@ -210,12 +219,15 @@ def _build_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-def _check_depth(value: Any) -> None:
-    """Raise a RecursionError where lists and objects are nested more than `MAX_DEPTH` deep."""
-    level = [value] if isinstance(value, dict | list) else []
-    for _ in range(MAX_DEPTH + 1):
-        groups = [group.values() if isinstance(group, dict) else group for group in level]
-        level = [inner for group in groups for inner in group if isinstance(inner, dict | list)]
-        if not level:
-            return
+def _count_names(value: Any) -> int:
+    """Number of names in all objects; a RecursionError where brackets are nested more than `MAX_DEPTH` deep."""
+    count, level = 0, [value]
+    for _ in range(MAX_DEPTH + 2):
+        objects = [inner for inner in level if inner.__class__ is dict]
+        lists = [inner for inner in level if inner.__class__ is list]
+        if not objects and not lists:
+            return count
+        count += sum(map(len, objects))
+        level = chain(chain.from_iterable(map(dict.values, objects)), chain.from_iterable(lists))
+        level = [inner for inner in level if inner.__class__ is dict or inner.__class__ is list]
     raise RecursionError

@@ -28,6 +28,7 @@ from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
+from rlftsim.policies.hub import is_hub_url, pull_model
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
@@ -205,12 +206,12 @@ def find_model(name: str | os.PathLike) -> Path:
     """Path of a model folder.
 
     Args:
-        name: Model folder, or folder of a finished run, which has a model folder inside.
+        name: Model folder, or folder of a finished run, which has a model folder inside, or hf://USER/NAME[@REVISION].
 
     Raises:
         ConfigError: There is no such folder.
     """
-    folder = Path(name).expanduser()
+    folder = pull_model(name) if is_hub_url(name) else Path(name).expanduser()
     if folder.is_file():
         raise ConfigError(f"{str(name)!r} is a file: name its folder, {folder.parent}.")
     if (folder / "model" / CONFIG).exists():
@@ -234,6 +235,7 @@ def read_card(name: str | os.PathLike, *, heading_shift: int = 2) -> str | None:
     try:
         folder = SHIPPED_MODELS / name if _ships(name) else find_model(name)
         text = (folder / CARD).read_text(encoding="utf-8", errors="replace")
+        text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)  # the header of a hub
     except (ConfigError, OSError):
         return None
     return re.sub(r"^#+", lambda match: "#" * min(len(match[0]) + heading_shift, 6), text.strip(), flags=re.MULTILINE)

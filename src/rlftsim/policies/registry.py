@@ -20,6 +20,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.policies import SHIPPED_POLICIES
 from rlftsim.policies.checkpoint import find_similar_model, read_model
+from rlftsim.policies.hub import is_hub_url
 from rlftsim.rollout.policy import LoadablePolicy, Policy
 
 POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
@@ -38,7 +39,8 @@ def load_policy(name: str | os.PathLike, device: Device = "cpu") -> Policy:
     """Policy of a name, in evaluation mode and with frozen weights.
 
     Args:
-        name: Registered name ("constant_velocity"), model folder as `save_pretrained` writes, or a run's folder.
+        name: Registered name ("constant_velocity"), model folder as `save_pretrained` writes, a run's folder, or
+            hf://USER/NAME[@REVISION].
             Where a folder is named like a registered policy, "./name" is the folder.
         device: Device of the weights; a policy without weights takes the batch's device.
 
@@ -74,7 +76,7 @@ def _load(name: str | os.PathLike, device: Device, *extra_names: str) -> Policy:
             policy = registered()
         except SystemExit as stop:  # it would end the command, with exit() even as if all were done
             raise ConfigError(f"policy {name!r} calls exit({stop.code!r}) when it is made: let it raise.") from stop
-    elif Path(name).expanduser().exists():
+    elif is_hub_url(name) or Path(name).expanduser().exists():
         # a folder; a file is refused by name
         stored = read_model(name)
         policy = _loadable(stored.architecture).from_pretrained(stored.folder)

@@ -38,6 +38,7 @@ _SHIPPED = {
     DEFAULT_SOURCE: "rlftsim.scenario.womd:WomdSource",
     "av2": "rlftsim.scenario.av2:Av2Source",
     "tables": "rlftsim.scenario.tables:TablesSource",
+    "gpudrive": "rlftsim.scenario.gpudrive:GpudriveSource",
 }
 SOURCES: ExtensionPoint[Any] = ExtensionPoint(
     "data source", "rlftsim.sources", _SHIPPED, use=lambda name: _load_source(name)

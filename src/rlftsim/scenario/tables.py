@@ -186,7 +186,7 @@ def _read_scenario(row: Rows, tables: Mapping[str, Rows]) -> Scenario:
         )
     predicted = _find_indices(row, "predict", tracks)
     if predicted is None:
-        predicted = _choose_predicted(tracks, ego)
+        predicted = choose_predicted(tracks, ego)
         guessed.add("predict")
     interest = _find_indices(row, "interest", tracks) or []
     lights = _read_lights(tables.get(LIGHTS), first_step, step_s, tracks.valid.shape[1], map_features)
@@ -290,7 +290,7 @@ def _sample_rows(
     return at_row | (between & (seconds[next_row] - seconds[row] <= LONGEST_HOLE_S + _EPSILON_S)), row
 
 
-def _choose_predicted(tracks: Tracks, ego: int) -> list[int]:
+def choose_predicted(tracks: Tracks, ego: int) -> list[int]:
     """Up to eight objects nearest to the ego at the current step that are always valid and move, in track order."""
     moved = np.linalg.norm(tracks.position[:, -1, :2] - tracks.position[:, CURRENT_STEP, :2], axis=1)
     fits = tracks.valid.all(1) & (moved > 1.0) & (tracks.object_type != ObjectType.OTHER)

@@ -6,7 +6,7 @@ leaves files through `training.run_folder`.
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -48,6 +48,7 @@ def train_policy(
     card: str = "",
     max_updates: int | None = None,
     on_update: OnUpdate | None = None,
+    trackers: Collection[str] = ("tensorboard",),
 ) -> Path:
     """Train a policy in place; resumes where a run in `out` was stopped, or ended below a setting that `may_grow`.
 
@@ -63,6 +64,7 @@ def train_policy(
             number continues to the same weights. None = all that the settings ask for.
         on_update: Function that the first process calls behind each update with the number of updates done and the
             metrics by name. An error in the function ends the run, which goes on from the last checkpoint.
+        trackers: Names of trackers, which receive the metrics of each update.
 
     Returns:
         The model folder, `out/model`.
@@ -86,7 +88,9 @@ def train_policy(
         settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
     )
     settings = replace(settings, device=replace(settings.device, processes=processes))
-    work = partial(_make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update)
+    work = partial(
+        _make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers
+    )
     with linked_processes(work, settings.device) as fabric:
         return work(fabric)
 
@@ -123,6 +127,7 @@ def _make_updates(
     card: str,
     max_updates: int | None,
     on_update: OnUpdate | None,
+    trackers: Collection[str],
     fabric: Fabric,
 ) -> Path:
     """The model of a run: all updates that are left, in this process.
@@ -137,7 +142,7 @@ def _make_updates(
     learner = method.start(policy, scenarios, settings, fabric)
     update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
     with _hold_folder(out, fabric):
-        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric, held_out, max_updates)
+        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric, held_out, max_updates, trackers)
         validator = None
         if held_out is not None:
             # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
@@ -209,6 +214,8 @@ class TrainingRun:
     """Scenarios to validate on."""
     max_updates: int | None = None
     """Updates after which the run ends early."""
+    trackers: Collection[str] = ()
+    """Names of trackers."""
 
     def __post_init__(self) -> None:
         learner, is_first = self.learner, self.fabric.is_global_zero
@@ -246,7 +253,7 @@ class TrainingRun:
             if progress.numbers.get(STOPPED) and not self.folder.grows_from:
                 self.num_updates = learner.update
         # Metrics of updates behind the checkpoint would appear twice.
-        self.folder.continue_from(learner.update)
+        self.folder.continue_from(learner.update, self.trackers if learner.update < self.num_updates else ())
         for values in read_metrics(self.folder.path):
             if values["update"] <= learner.update:  # the process of rank 0 may not have dropped the others yet
                 self._choose_best(values)
@@ -278,6 +285,10 @@ class TrainingRun:
             newest = newest_checkpoint(self.folder.checkpoints)
             # The command line says what the same command does next.
             stop.args = (f"continues behind update {parse_update(newest)}" if newest else "starts anew",)
+            self.folder.finish_trackers("stopped")
+            raise
+        except Exception:
+            self.folder.finish_trackers("failed")
             raise
 
     def keep_best(self, values: Mapping[str, Any]) -> None:
@@ -349,12 +360,12 @@ class TrainingRun:
         learner = self.learner
         learner.finish()
         self._take_best()
-        self.folder.close()
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds
             learner.policy.load_state_dict(learner.result.state_dict())
         if self.fabric.is_global_zero:
             learner.policy.eval().save_pretrained(self.folder.model, card=card)
+        self.folder.finish_trackers("finished")
         return self.folder.model
 
     def _take_best(self) -> None:

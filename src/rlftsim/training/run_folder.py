@@ -2,7 +2,8 @@
 
 config.json        the settings, every default filled in
 environment.json   versions, machine, command, commit
-metrics.jsonl      a line per update; also as TensorBoard events in tensorboard/
+metrics.jsonl      a line per update; also as TensorBoard events in tensorboard/, or in other trackers
+trackers.json      ids of the run in trackers
 checkpoints/       all that the run resumes from, see `write_checkpoint`
 best/              weights behind the best validations, where the best is kept
 model/             the trained policy, once the run is done (`save_pretrained`)
@@ -21,7 +22,7 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import nn
 
@@ -29,16 +30,13 @@ from rlftsim import __version__
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.documents import parse_json, read_json
-from rlftsim.jobs.files import append_text, errors_name, save_tensors, write_text
+from rlftsim.jobs.files import append_text, save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios, list_scenario_ids
-from rlftsim.training.board import write_settings
 from rlftsim.training.checkpoint import check_weights, list_checkpoints, newest_checkpoint, parse_update
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
+from rlftsim.training.trackers import RunTrackers, Status
 
 PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 """Packages whose versions are stored with a run."""
@@ -60,30 +58,12 @@ def may_change(name: str) -> bool:
     return any(name == free or name.startswith(f"{free}.") for free in MAY_CHANGE)
 
 
-BOARD_GROUPS = {
-    "reward": ("reward_",),
-    "kl": ("kl", "beta"),
-    "realism": ("rmm", "kinematic", "interactive", "map_based"),
-    "alarm": ("alarm_",),
-    "goal": ("goal_", "hindsight_"),
-    "validation": ("validation_",),
-    "time": ("seconds",),
-}
-"""Groups of metrics in TensorBoard: by the beginnings of their names."""
-
-
 SCENARIO_FILES = "scenario_files"
 """Input that only data sets have, not lists of scenarios, and not runs of before: compared where both have it."""
 HELD_OUT = "held_out"
 """Input that only runs with validations have."""
 RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, HELD_OUT, "augmented_goals")
 """Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
-
-
-def board_tag(name: str) -> str:
-    """A metric's name in TensorBoard: the name in metrics.jsonl, behind the group if any."""
-    groups = [group for group, beginnings in BOARD_GROUPS.items() if name.startswith(beginnings)]
-    return "/".join([*groups, name])
 
 
 def describe_inputs(policy: object, scenarios: Scenarios, held_out: Scenarios | None = None) -> dict[str, str]:
@@ -191,7 +171,7 @@ class RunFolder:
         self.model = path / "model"
         self._writes = writes
         self._metrics = path / "metrics.jsonl"
-        self._board: SummaryWriter | None = None
+        self._trackers: RunTrackers | None = None
         # Settings and inputs stand in one file: both make a run what it is.
         self._settings = {**to_plain(config), **(inputs or {})}
         stored = self._checked_stored_settings(self._settings, may_grow)
@@ -302,21 +282,20 @@ class RunFolder:
         newest = newest_checkpoint(self.checkpoints)
         return CheckpointError(f"{self.path}: {cause}. The last good checkpoint is {newest or 'none'}: {remedy}.")
 
-    def continue_from(self, update: int) -> None:
-        """Drop the metrics of updates that will be done again: those after `update`."""
+    def continue_from(self, update: int, trackers: Collection[str] = ()) -> None:
+        """Drop the metrics of updates that will be done again, and let trackers begin.
+
+        Args:
+            update: Number of updates done; metrics of later ones are dropped.
+            trackers: Names of trackers.
+        """
         if not self._writes:
             return
-        from torch.utils.tensorboard import SummaryWriter  # not at the top: `--help` has no use for it
-
         if self._metrics.exists():
             # a line cut short by a kill goes, too
             lines = [line for line, values in _read_lines(self._metrics) if values["update"] <= update]
             write_text(self._metrics, "".join(f"{line}\n" for line in lines))
-        board = self.path / "tensorboard"
-        with errors_name(board):
-            self._board = SummaryWriter(str(board), purge_step=update + 1)
-            if not update:
-                write_settings(self._board, flatten(self._settings))
+        self._trackers = RunTrackers(trackers, self.path, flatten(self._settings))
 
     def log(self, update: int, values: Mapping[str, float]) -> None:
         """Add a line of metrics.
@@ -329,16 +308,13 @@ class RunFolder:
             return
         line = json.dumps({"update": update, "time": round(time.time(), 3), **values})
         append_text(self._metrics, f"{line}\n")
-        if self._board is not None:
-            with errors_name(self.path / "tensorboard"):
-                for name, value in values.items():
-                    self._board.add_scalar(board_tag(name), value, update)
+        if self._trackers is not None:
+            self._trackers.log(values, update)
 
-    def close(self) -> None:
-        """Flush pending metrics."""
-        if self._board is not None:
-            with errors_name(self.path / "tensorboard"):
-                self._board.close()
+    def finish_trackers(self, status: Status) -> None:
+        """End the run in all trackers; a finished one hands over the model."""
+        if self._trackers is not None:
+            self._trackers.finish(status, self.model if status == "finished" else None)
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

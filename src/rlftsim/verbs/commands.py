@@ -126,14 +126,15 @@ VERBS = {
         Command("model:list_models"), starts_anew=True,
     ),
     "model": Verb(
-        "average models; import a checkpoint of the public CAT-K code, or export one",
+        "average or upload models; import a checkpoint of the public CAT-K code, or export one",
         {
             "show": Command("model:show_model", ("model",)),
             "average": Command("model:average_models", ("models",)),
             "import": Command("model:import_model", ("checkpoint",), names={"format": "from"}),
             "export": Command("model:export_model", ("model", "out"), names={"format": "to"}),
+            "push": Command("model:push_model", ("model", "url")),
         },
-        "Show or average models, import a checkpoint of the public CAT-K code, or export a model to it.",
+        "Show, average or upload models, import a checkpoint of the public CAT-K code, or export a model to it.",
         starts_anew=True,
     ),
     "goals": Verb(
@@ -148,6 +149,11 @@ VERBS = {
     "simulate": Verb(
         "roll out scenarios with a model",
         Command("simulate:simulate", ("policy",), ("out",), {**MODEL, **DATA}, "print_rollouts", has_shares=True),
+    ),
+    "export": Verb(
+        "write stored rollouts as files that other programs read",
+        Command("export:export", ("exporter", "rollouts", "out"), ("scenarios",), {"exporter": "FORMAT"}),
+        starts_anew=True,
     ),
     "drive": Verb("let a planner drive among simulated traffic, and score both", Command("drive:drive", ("planner",))),
     "failures": Verb(

@@ -32,9 +32,9 @@ def convert(
         source: WOMD tfrecord shard, folder of shards, or quoted glob such as 'training/*tfrecord*'; of other sources
             a folder.
         destination: Folder of the data set.
-        reader: Format of the source: womd, av2 (Argoverse 2 motion forecasting), tables (Parquet tables of your
-            own recordings), or the name of a data source of another package (docs/extending.md). auto:
-            recognized by the files.
+        reader: Format of the source: womd, av2 (Argoverse 2 motion forecasting), gpudrive (JSON of GPUDrive,
+            PufferDrive and Nocturne), tables (Parquet tables of your own recordings), or the name of a data source of
+            another package (docs/extending.md). auto: recognized by the files.
         split: Split of all sources; left out, it is read off their folder or name.
         on_error: Fate of a damaged record: it is left out and listed, or the command stops with exit status 1.
         jobs: Processes, each with a shard of its own. Left out: one for each core.

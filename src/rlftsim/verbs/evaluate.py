@@ -11,6 +11,7 @@ from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
+from rlftsim.policies.hub import pin_model
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
@@ -84,7 +85,7 @@ def evaluate(
         raise ConfigError(f"--guidance-scale {guidance_scale:g} has no effect without goals: add --goals logged.")
     # 2. The policy and its name.
     if isinstance(policy, str | os.PathLike):
-        name = name or evaluation.evaluation_name(policy)
+        name = name or evaluation.evaluation_name(pin_model(policy))
         model = load_policy_or_oracle(policy, device)
     else:
         model = to_policy(policy)

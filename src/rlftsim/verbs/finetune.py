@@ -94,6 +94,7 @@ def finetune(
     on_update: OnUpdate | None = None,
     split: str = "training",
     validation_split: str | None = None,
+    tracker: str = "tensorboard",
 ) -> Policy:
     """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), by CAT-K, by RoaD or by
     calibration.
@@ -143,6 +144,8 @@ def finetune(
         split: Split of the data set to train on.
         validation_split: With rlft, catk and road: split to validate on in closed loop, see
             --finetune.validation.every. Left out: "tune", the part of "validation" that is not of the exam.
+        tracker: Programs that show the run while it trains, with commas between: tensorboard, wandb, mlflow, trackio,
+            those of other packages, or module:Class. metrics.jsonl is always written. Empty: none.
 
     Returns:
         The fine-tuned policy, ready to simulate.
@@ -184,6 +187,7 @@ def finetune(
         card=card,
         max_updates=max_updates,
         on_update=on_update,
+        tracker=tracker,
     )
 
 

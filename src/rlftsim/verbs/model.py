@@ -1,4 +1,4 @@
-"""`rlftsim model`: show and average models, import and export checkpoints of the public CAT-K code."""
+"""`rlftsim model`: show, average and upload models, import and export checkpoints of the public CAT-K code."""
 
 import sys
 from pathlib import Path
@@ -8,10 +8,12 @@ from torch import nn
 
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
+from rlftsim.evaluation.hub_card import read_evaluation, write_hub_card
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import print_line, print_lines
 from rlftsim.policies.averaging import average_policies
-from rlftsim.policies.checkpoint import read_card
+from rlftsim.policies.checkpoint import CARD, find_model, read_card
+from rlftsim.policies.hub import FILES, push_files
 from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -68,6 +70,36 @@ def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
     print_line(f"{tables}: token tables")
     if not policy.config.catk_compat:
         print_line("  trained here: the public code treats an agent's first motion differently (docs/catk.md)")
+
+
+def push_model(
+    model: Path, url: str, *, license: str | None = None, i_comply: bool = False, evaluation: Path | None = None
+) -> None:
+    """Upload a model to Hugging Face, with a card that names data, license and scores.
+
+    The license follows from the data that the weights have seen, those of the models they were made from included.
+
+    Args:
+        model: Model folder, or folder of a finished run.
+        url: Address of the repository, hf://USER/NAME; made if missing. A login is found by huggingface_hub.
+        license: License of the weights, an identifier of Hugging Face such as cc-by-4.0. Left out where the data's
+            terms leave no choice.
+        i_comply: Declare, of weights made from the Waymo Open Dataset, that publishing them is in keeping with its
+            license agreement: non-commercial use alone, its notice, and recipients who are bound by it.
+        evaluation: Result of `rlftsim evaluate` with this very model; its means and intervals go onto the card.
+
+    Raises:
+        ConfigError: Data of unknown terms, a license that contradicts them, a missing declaration, or an evaluation of
+            another model.
+        DataError: No network, or no right to write there.
+    """
+    policy, folder = load_policy(model), find_model(model)
+    result = None if evaluation is None else read_evaluation(evaluation, policy)
+    card = read_card(folder, heading_shift=0) or ""
+    text = write_hub_card(url, card, license, i_comply=i_comply, evaluation=result)
+    paths = [path for pattern in FILES for path in sorted(folder.rglob(pattern)) if path.is_file()]
+    files: dict[str, Path | bytes] = {path.relative_to(folder).as_posix(): path for path in paths}
+    print_line(f"{push_files(url, files | {CARD: text.encode()})}: {len(files)} files")
 
 
 def average_models(models: list[str], out: Path, *, base: str | None = None, scale: float = 1.0) -> None:

@@ -18,6 +18,7 @@ POINTS = {
     "rlftsim.features": "rlftsim.policies.calibrated.features:FEATURES",
     "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
     "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
+    "rlftsim.trackers": "rlftsim.training.trackers:TRACKERS",
     "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",
 }
 """Entry-point group -> module and name of its `ExtensionPoint`."""
@@ -77,9 +78,9 @@ def describe_failures(entry: EntryPoint) -> str | None:
 def plugins() -> int:
     """List what other installed packages add, with package and version, and the reason where one fails.
 
-    Each is tried out, of rewards, policies, training methods, data sources, recipes, experiments, planners and
-    exporters: policies, planners and recipes are made, rewards are checked on two small scenarios. The exit status is 1
-    if one fails. The others are used all the same.
+    Each is tried out, of rewards, policies, training methods, data sources, recipes, experiments, planners, trackers
+    and exporters: policies, planners and recipes are made, rewards are checked on two small scenarios. The exit status
+    is 1 if one fails. The others are used all the same.
     """
     plug_ins = list_plug_ins()
     if not plug_ins:

@@ -95,6 +95,7 @@ def pretrain(
     on_update: OnUpdate | None = None,
     split: str = "training",
     validation_split: str | None = None,
+    tracker: str = "tensorboard",
 ) -> Policy:
     """Train a model on logged tracks (SMART: to predict the next motion token of every agent), from fresh weights or
     further (--init-from).
@@ -136,6 +137,8 @@ def pretrain(
         split: Split of the data set to train on.
         validation_split: Split to validate on in closed loop, see --pretrain.validation.every. Left out: "tune", the
             part of "validation" that is not of the exam.
+        tracker: Programs that show the run while it trains, with commas between: tensorboard, wandb, mlflow, trackio,
+            those of other packages, or module:Class. metrics.jsonl is always written. Empty: none.
 
     Returns:
         The pre-trained policy, ready to simulate; a policy that was handed over stays as it is.
@@ -188,6 +191,7 @@ def pretrain(
         card=card,
         max_updates=max_updates,
         on_update=on_update,
+        tracker=tracker,
     )
 
 

@@ -16,6 +16,7 @@ from torch import nn
 from rlftsim.errors import ConfigError, RlftsimError, whole_number
 from rlftsim.evaluation.learning_curve import film_model, write_calibration_picture, write_learning_curve
 from rlftsim.jobs.progress import log, print_line
+from rlftsim.policies.hub import pin_model
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.card import append_cards, model_card
 from rlftsim.rollout.policy import Policy, get_device
@@ -24,6 +25,7 @@ from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
+from rlftsim.training.trackers import find_tracker
 from rlftsim.verbs.inputs import remember_name, to_policy
 from rlftsim.verbs.runs import SEED_FOLDER, print_runs
 from rlftsim.verbs.runs import runs as list_runs
@@ -58,6 +60,7 @@ def train(
     settings: Any,
     *,
     device: Any,
+    tracker: str,
     **options: Any,
 ) -> Any:
     """The policy, trained in place and ready to simulate; the pictures of its run are drawn.
@@ -68,22 +71,29 @@ def train(
         out: Folder of the run; None = a temporary one.
         settings: Settings of the method.
         device: Device of the result.
+        tracker: Names of trackers, with commas between.
         options: Further arguments of `train_policy`, such as the scenarios for validation.
+
+    Raises:
+        ConfigError: An unknown tracker, or see `train_policy`.
     """
+    trackers = [name for name in tracker.split(",") if name]
+    for name in trackers:  # a mistyped one is refused before any work
+        find_tracker(name)
     # Weights of a loaded policy are frozen; each method freezes again what it does not train.
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)
     if out is None:
         with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
-            train_policy(policy, scenarios, folder, settings, **options)
+            train_policy(policy, scenarios, folder, settings, trackers=trackers, **options)
     else:
         with _learning_curve(Path(out)):
-            model = train_policy(policy, scenarios, out, settings, **options)
+            model = train_policy(policy, scenarios, out, settings, trackers=trackers, **options)
         if is_first_process():
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
     policy.eval().requires_grad_(False).to(device)
-    if out is not None and is_first_process():
+    if out is not None and "tensorboard" in trackers and is_first_process():
         with suppress(RlftsimError, OSError):  # a picture is no reason to lose a model
             film_model(Path(out), policy, (options["held_out"] or scenarios)[0])
     if out is not None:
@@ -135,7 +145,7 @@ def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str
         scenarios: Training scenarios.
         start: Policy that training started from, or its name; None = fresh weights.
     """
-    name = start if isinstance(start, str | os.PathLike) else None
+    name = pin_model(start) if isinstance(start, str | os.PathLike) else None
     if start is not None:
         description = f"{description} from {name or type(start).__name__}"
     if isinstance(scenarios, ScenarioDataset):

@@ -5,7 +5,6 @@ mine = "my_package:MyPlanner"
 """
 
 import ast
-import importlib
 import inspect
 import secrets
 import sys
@@ -16,7 +15,7 @@ from typing import Any, Protocol, get_args, runtime_checkable
 
 from rlftsim.envs.actions import MIN_HORIZON, ActionType
 from rlftsim.errors import ConfigError, DataError, RlftsimError, in_short, locate_error
-from rlftsim.plugins import ExtensionPoint
+from rlftsim.plugins import ExtensionPoint, import_object
 from rlftsim.scenario.shards import hash_file
 
 PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
@@ -91,20 +90,7 @@ def load_planner(name: str) -> Planner:
     if name.startswith(SB3):
         return _load_sb3(name.removeprefix(SB3))
     location, options = _split_options(name)
-    if ":" in location:
-        module, _, attribute = location.partition(":")
-        if not module or module.startswith("."):
-            raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
-        if "" not in sys.path:
-            sys.path.insert(0, "")  # a planner in a file of this folder is found, as by `python -m`
-        try:
-            loaded = getattr(importlib.import_module(module), attribute)
-        except (Exception, SystemExit) as error:  # a file of others may fail in any way
-            raise ConfigError(
-                f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
-            ) from error
-    else:
-        loaded = PLANNERS.get(location)
+    loaded = import_object("planner", location) if ":" in location else PLANNERS.get(location)
     try:
         if options and not isinstance(loaded, type):
             inspect.signature(loaded).bind_partial(**options)
