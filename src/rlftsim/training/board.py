@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a run beside the metrics: the settings, as text and as hyper-parameters, and a film."""
+"""Settings and a film in TensorBoard, beside the metrics of a run."""
 
 import io
 import json
@@ -16,7 +16,7 @@ COMPARED = ("validation/validation_rmm", "realism/rmm", "loss")
 
 
 def write_settings(board: "SummaryWriter", settings: Mapping[str, Any]) -> None:
-    """Add the settings of a run, as a table of text and as hyper-parameters that runs are compared by.
+    """Add the settings of a run, as a table of text and as hyper-parameters to compare runs.
 
     Args:
         board: Open writer of the run's events.

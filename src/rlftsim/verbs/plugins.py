@@ -60,7 +60,7 @@ def list_plug_ins() -> list[PlugIn]:
 
 
 def describe_failures(entry: EntryPoint) -> str | None:
-    """One line about the rules that rewards of a package break, on two small scenarios; None = they break none."""
+    """One line about the rules that rewards of a package break, on two small scenarios; None = no rule is broken."""
     from rlftsim.rewards import REWARDS  # imported late, with torch: few packages have rewards
     from rlftsim.verbs.check_reward import check_reward
 

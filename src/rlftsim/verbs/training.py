@@ -90,7 +90,7 @@ def train(
 
 
 def repeat_for_seeds(verb: Callable[Parameters, Policy]) -> Callable[Parameters, Policy]:
-    """Decorator of a verb that trains: with `seeds` it runs as often, with a seed and a folder for each.
+    """Decorator of a verb that trains: `seeds` repeats the verb with a seed and a folder for each run.
 
     The policy of the first run is returned.
     """
@@ -143,7 +143,7 @@ def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str
 
 
 def with_changes(settings: Any, processes: Any, seed: int | None) -> Any:
-    """Settings of a run on so many processes and with this seed; None leaves either as it is.
+    """Settings of a run on so many processes and with this seed; None changes nothing.
 
     Args:
         settings: Settings of the method.
