@@ -24,6 +24,8 @@ from av2_files import write_av2
 from gpudrive_files import write_file
 from rlftsim.cli.main import main, parse
 from rlftsim.envs import EgoEnv
+from rlftsim.envs.observations import SHAPES
+from rlftsim.envs.planners.registry import load_planner
 from rlftsim.errors import RlftsimError
 from rlftsim.evaluation.drive_results import DriveResult
 from rlftsim.evaluation.evaluate import EvaluateConfig
@@ -251,6 +253,20 @@ def make_catk(folder: Path) -> None:
     torch.save(content, folder / "epoch.ckpt")
     write_catk(policy, folder / "weights.safetensors")
     write_catk_vocabulary(policy.vocabulary, folder / "tables.npz")
+
+
+def make_learned_planner(folder: Path) -> None:
+    from stable_baselines3 import PPO
+
+    from rlftsim.envs.sb3 import SB3VecEnv
+
+    env = SB3VecEnv(1, scenarios=[scenes.straight_road()], traffic="replay", observation="flat")
+    PPO("MlpPolicy", env, n_steps=8, batch_size=8, policy_kwargs={"net_arch": [2]}).save(folder / "ppo.zip")
+
+
+def read_learned_planner(folder: Path) -> None:
+    planner = load_planner(f"sb3:{folder / 'ppo.zip'}")
+    planner.act({name: np.zeros(shape) for name, shape in SHAPES.items()})
 
 
 def _sizes(policy: rs.SmartPolicy) -> dict[str, object]:
@@ -567,6 +583,7 @@ FORMATS: Mapping[str, Format] = {
         read_policy,
         ("policies.checkpoint",),
     ),
+    "learned planner": Format({"ppo.zip": "npz"}, make_learned_planner, read_learned_planner, ("envs.planners.sb3",)),
     "CAT-K checkpoint": Format(
         {"epoch.ckpt": "checkpoint"},
         make_catk,

@@ -51,7 +51,7 @@ class CheckpointError(RlftsimError):
 
 
 class PackageError(RlftsimError):
-    """An error in code of another package, such as a reward; the message names the package, the error and the line."""
+    """An error in code of an installed package, such as a reward; the message names package, error and line."""
 
     exit_status = 1
 
@@ -98,7 +98,7 @@ def locate_error(error: BaseException) -> str:
 
 
 def find_package_error(error: BaseException) -> PackageError | None:
-    """An error in other words, where code raised it of an installed package that extends this one; else None."""
+    """One line in place of an error that code of an installed package raised; None for other errors."""
     from importlib.metadata import distributions  # not at the top: it takes longer than all else that is imported here
 
     packages = {

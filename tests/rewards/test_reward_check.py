@@ -122,11 +122,8 @@ def test_rewards_of_packages_are_tried_and_their_errors_name_the_package(forgetf
     with third_party.installed(tmp_path / "site", "rough_rewards", PACKAGE, entries):
         assert main(["plugins"]) == 1
         printed = capsys.readouterr().out
-        states = {
-            row[1].strip(): row[-2].strip()
-            for row in map(lambda line: line.split("│"), printed.splitlines())
-            if len(row) > 2
-        }
+        rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in printed.splitlines()]
+        states = {row[1]: row[5] for row in rows if len(row) == 6 and row[0] == "rlftsim.rewards"}
         assert states == {"slow": "fails", "raising": "fails", "fine": "works"}
         assert (
             "reward 'slow' of rough_rewards:slow breaks the contract, see rs.check_reward: padding changes" in printed

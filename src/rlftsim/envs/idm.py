@@ -137,7 +137,7 @@ def choose_leaders(
         boxes: Motion x, y, heading, vx, vy of the boxes.
     """
     any_box = meets.any(1)  # [M, W]
-    first, has_leader, row = any_box.argmax(1), any_box.any(1), np.arange(len(meets))
+    first, has_leader, row = any_box.argmax(1), np.any(any_box, axis=1), np.arange(len(meets))
     box = meets[row, :, first].argmax(1)
     velocity, line_heading = boxes[row, box, 3:], heading[row, first]
     speed = np.maximum(velocity[:, 0] * np.cos(line_heading) + velocity[:, 1] * np.sin(line_heading), 0.0)

@@ -54,7 +54,7 @@ def write_hub_card(
         raise ConfigError(f"{url}: add --license, such as cc-by-4.0, in keeping with: {' '.join(dict.fromkeys(terms))}")
     if license not in (None, chosen):
         raise ConfigError(f"{url}: --license {license} contradicts the terms of the data, {chosen}: leave it out.")
-    header = {"license": chosen, **(_WAYMO if is_waymo else {})}
+    header: dict[str, Any] = {"license": chosen, **(_WAYMO if is_waymo else {})}
     header |= {"library_name": "rlftsim", "tags": ["traffic-simulation"]}
     if evaluation is not None:
         header["model-index"] = [{"name": url.rpartition("/")[2], "results": [_describe_scores(evaluation)]}]

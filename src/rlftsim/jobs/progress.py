@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -93,7 +93,7 @@ def print_wide(*tables: object) -> None:
             column.overflow = "fold"
             # a label that may not be broken would be cut where it does not fit beside the numbers
             unlimited = console.options.update(max_width=10**6)
-            column.no_wrap &= Measurement.get(console, unlimited, table).minimum <= console.width
+            column.no_wrap &= Measurement.get(console, unlimited, cast(Table, table)).minimum <= console.width
         console.print(table)
 
 

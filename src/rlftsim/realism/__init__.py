@@ -17,6 +17,7 @@ from rlftsim.realism.config import (
 )
 from rlftsim.realism.credit import AgentScores, Credit, compute_credit, compute_single_credit
 from rlftsim.realism.features import ComputeConfig, Features, ScenarioLog, compute_features, scenario_log
+from rlftsim.realism.from_rollouts import score_rollouts
 from rlftsim.realism.meta_metric import (
     RealismResult,
     ScenarioFeatures,
@@ -32,5 +33,5 @@ __all__ = [
     "AgentScores", "ComputeConfig", "Credit", "Features", "MetricConfig", "RealismResult", "ScenarioFeatures",
     "ScenarioLog", "SimulatedStates", "compute_batch_features", "compute_credit", "compute_features",
     "compute_single_credit", "metric_by_name", "scenario_log", "score", "score_batch", "score_batch_features",
-    "score_features",
+    "score_features", "score_rollouts",
 ]  # fmt: skip

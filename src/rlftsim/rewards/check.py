@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlftsim.realism import AgentScores, RealismResult
-from rlftsim.realism.from_rollouts import score_rollouts
+from rlftsim.realism import AgentScores, RealismResult, score_rollouts
 from rlftsim.rewards.base import AgentRewards, Reward
 from rlftsim.rollout.contract import CheckReport, RuleBroken, RuleNotApplicable, check_limit, check_rules, compute_gap
 from rlftsim.rollout.types import Rollouts
@@ -64,11 +63,11 @@ class RewardRules:
     def the_same_rollouts_get_the_same_numbers(self) -> str:
         """A second call gives the same values."""
         expected = self._computed
-        again = self._compute(self._rewards, self._batch, self._rollouts)
-        return self._check_gap(max(map(compute_gap, again, expected)))
+        repeated = self._compute(self._rewards, self._batch, self._rollouts)
+        return self._check_gap(max(map(compute_gap, repeated, expected)))
 
     def nothing_is_changed(self) -> str:
-        """Rollouts and scenarios are the same after a call, as other terms read them, too."""
+        """Rollouts and scenarios, which further terms read, are the same after a call."""
         tensors = (self._rollouts.position, self._rollouts.heading, self._batch.position, self._batch.heading)
         copies = [tensor.clone() for tensor in tensors]
         if self._computed:
@@ -78,7 +77,7 @@ class RewardRules:
         return "positions and headings stay"
 
     def padding_changes_no_number(self) -> str:
-        """A scenario alone earns what it earns in a batch with a larger one."""
+        """A scenario earns the same alone and in a batch with a larger scenario."""
         batch, expected, gaps = self._batch, self._computed, []
         if len(set(batch.agent_mask.sum(-1).tolist())) < 2:
             raise RuleNotApplicable("no scenario is padded: hand over scenarios with different numbers of agents")

@@ -1,7 +1,7 @@
 """Rules of a contract, each tried on an object, and the report of those that hold.
 
-A contract is a class with a public method for each rule: it returns the measurement as a text, or raises `RuleBroken`
-or `RuleNotApplicable`.
+A contract is a class with a public method for each rule, which returns the measurement as a text, or raises
+`RuleBroken` or `RuleNotApplicable`.
 """
 
 import math
@@ -65,8 +65,8 @@ def check_rules(rules: object, name: str) -> CheckReport:
     """Try every rule of a contract.
 
     Args:
-        rules: Object of a class with a public method for each rule, bound to what is tried.
-        name: Name of what is tried, for the report.
+        rules: Object of a contract, with the policy or reward to try.
+        name: Name of the policy or reward, for the report.
 
     Returns:
         A result per rule. A rule with an error in the check counts as failed, with the error as detail.

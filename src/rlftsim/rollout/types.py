@@ -141,7 +141,7 @@ class Rollouts:
         )
 
     def select_scenario(self, row: int, num_agents: int) -> "Rollouts":
-        """Rollouts of one scenario, a batch of its own; without the steps that were forced.
+        """Rollouts of a single scenario; without the steps that were forced.
 
         Args:
             row: Index of the scenario on axis B.

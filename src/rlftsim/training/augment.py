@@ -18,13 +18,12 @@ from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items
 from rlftsim.jobs.runner import Inline, Runner
-from rlftsim.realism.from_rollouts import score_rollouts
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.config import AugmentConfig
 from rlftsim.training.data import batch_with_futures
-from rlftsim.training.experience import most_realistic_ends
+from rlftsim.training.experience import most_realistic_ends, score_rollouts
 from rlftsim.training.run_folder import RunFolder, describe_inputs
 
 

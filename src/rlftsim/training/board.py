@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a run beside the metrics: the settings, as text and as hyper-parameters, and a film."""
+"""Settings and a film in TensorBoard, beside the metrics of a run."""
 
 import io
 import json
@@ -16,7 +16,7 @@ COMPARED = ("validation/validation_rmm", "realism/rmm", "loss")
 
 
 def write_settings(board: "SummaryWriter", settings: Mapping[str, Any]) -> None:
-    """Add the settings of a run, as a table of text and as hyper-parameters that runs are compared by.
+    """Add the settings of a run, as a table of text and as hyper-parameters to compare runs.
 
     Args:
         board: Open writer of the run's events.
@@ -42,7 +42,7 @@ def write_film(board: "SummaryWriter", frames: Sequence[np.ndarray], step: int, 
         step: Number of updates done.
         frame_s: Seconds that a frame stays.
     """
-    from tensorboard.compat.proto.summary_pb2 import Summary
+    from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
     film, (first, *later) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
     first.save(film, format="GIF", save_all=True, append_images=later, duration=round(1000 * frame_s), loop=0)

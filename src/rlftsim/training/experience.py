@@ -12,8 +12,7 @@ from torch import Tensor
 
 from rlftsim.goals.attainment import is_passed, is_reached, rate
 from rlftsim.jobs.threads import one_thread
-from rlftsim.realism import RealismResult
-from rlftsim.realism.from_rollouts import score_rollouts
+from rlftsim.realism import RealismResult, score_rollouts
 from rlftsim.rewards import Rewards, Term, compute_rewards, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate

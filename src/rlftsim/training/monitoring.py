@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
-from rlftsim.realism.from_rollouts import score_rollouts
+from rlftsim.realism import score_rollouts
 from rlftsim.rollout.policy import Policy, Prediction, PretrainablePolicy, Sampling, frozen_copy
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate

@@ -60,8 +60,8 @@ def train_policy(
             along the log, and so on. A resumed run keeps the number of processes, which rounding depends on.
         held_out: Scenarios to validate on in closed loop, see `validation` of the settings; None = no validation.
         card: README of the resulting model folder.
-        max_updates: Updates after which the run ends early, with a model; no update depends on them, so that a larger
-            number continues to the same weights. None = all that the settings ask for.
+        max_updates: Updates after which the run ends early, with a model; no update depends on the number, so that a
+            larger number continues to the same weights. None = all that the settings ask for.
         on_update: Function that the first process calls behind each update with the number of updates done and the
             metrics by name. An error in the function ends the run, which goes on from the last checkpoint.
         trackers: Names of trackers, which receive the metrics of each update.

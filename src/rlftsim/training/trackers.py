@@ -113,7 +113,7 @@ class WandbTracker:
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
         """The id of the run there."""
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         project = os.environ.get("WANDB_PROJECT", PROJECT)
         self._run = wandb.init(
@@ -127,7 +127,7 @@ class WandbTracker:
 
     def artifact(self, path: str, kind: str) -> None:
         """An artifact of the run."""
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         artifact = wandb.Artifact(f"{kind}-{self._run.id}", kind)
         artifact.add_dir(path)
@@ -143,7 +143,7 @@ class MlflowTracker:
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
         """The id of the run there."""
-        import mlflow
+        import mlflow  # pyright: ignore[reportMissingImports]
 
         self._mlflow = mlflow
         mlflow.set_experiment(os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT))
@@ -170,7 +170,7 @@ class TrackioTracker:
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
         """The name of the run there, which differs from those of other runs."""
-        import trackio
+        import trackio  # pyright: ignore[reportMissingImports]
 
         name = resume or f"{Path(run).name}-{uuid.uuid4().hex[:8]}"
         self._run = trackio.init(

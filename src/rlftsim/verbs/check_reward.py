@@ -19,16 +19,16 @@ NUM_ROLLOUTS = 3
 
 
 def check_reward(reward: "Reward | str", scenarios: Data | None = None) -> CheckReport:
-    """Try every rule of the reward contract that applies: shape, finite numbers, the same ones for the same rollouts,
-    nothing changed, no influence of padding, shares of agents that add up. Takes seconds.
+    """Try every rule of the reward contract that applies: shape, finite numbers, equal numbers for equal rollouts, no
+    change of rollouts, no influence of padding, shares of agents that add up. Takes seconds.
 
     Args:
         reward: Function, or a registered name or a sum, such as "mloo + 0.1*on_the_road".
-        scenarios: Scenarios with different numbers of agents, and their logged futures; left out, two that ship with
-            the package.
+        scenarios: Scenarios with logged futures and different numbers of agents; left out, two that ship with the
+            package.
 
     Returns:
-        A result per rule. A rule whose check raised an error counts as failed, the error is its detail.
+        A result per rule. An error in the check of a rule counts as failed.
 
     Raises:
         ConfigError: Neither a function nor a sum of registered rewards.

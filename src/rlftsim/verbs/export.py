@@ -1,6 +1,8 @@
 """`rlftsim export`: stored rollouts in files of other programs."""
 
+from os import PathLike
 from pathlib import Path
+from typing import cast
 
 from rlftsim.evaluation.exporters import exporter_by_name, read_rollouts
 from rlftsim.evaluation.rollout_files import find_rollouts
@@ -26,7 +28,7 @@ def export(exporter: str, rollouts: Path, out: Path, *, scenarios: Data) -> None
         DataError: Rollouts of an unknown scenario, damaged ones, or those of other agents.
     """
     write, entries = exporter_by_name(exporter), find_rollouts(rollouts)
-    source = open_scenarios(dataset_folder(scenarios))
+    source = open_scenarios(dataset_folder(cast("str | PathLike[str]", scenarios)))
     with errors_name(out):
         out.mkdir(parents=True, exist_ok=True)
     for entry in entries:

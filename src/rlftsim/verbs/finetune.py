@@ -132,13 +132,13 @@ def finetune(
         goal_logit_bias: With --goal: add a goal-progress bias to the token logits (ours, not the paper's). Left out:
             yes where goal conditioning is added, unchanged where the model has it.
         processes: Processes that train, in short for the method's device.processes.
-        limit: Number of training scenarios, the first ones; left out, all of them.
+        limit: Number of training scenarios, from the first on; left out, all.
         max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
             weights of a run that never stopped: a learning rate that falls (catk, road, gcsl) falls as over all epochs
-            and is still high at an early end. Not for calibrate, which has a model at the end alone.
+            and is still high at an early end. Not for calibrate.
         seed: Seed of the run, in short for the method's seed.
-        seeds: Number of runs that differ in the seed alone, from 0 on: OUT/seed-0, OUT/seed-1 and so on. Their table at
-            the end has the mean with its 95 % interval. In Python the policy of the first run is returned.
+        seeds: Number of runs that differ in the seed alone, from 0 on: OUT/seed-0, OUT/seed-1 and so on. A table at the
+            end has the mean and the 95 % interval. In Python the policy of the first run is returned.
         on_update: Function that is called behind each update with the number of updates done and the metrics by name,
             `f(update, values)`. An error in the function ends the run, which goes on from the last checkpoint.
         split: Split of the data set to train on.
@@ -159,13 +159,7 @@ def finetune(
     if isinstance(config, PretrainConfig) or find_method(config) is None:
         check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training = to_scenarios(scenarios, split, limit)
-    settings: Any = config
-    if settings is None:
-        base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
-        # a recipe that is handed over has what it should have
-        if not isinstance(recipe, Recipe):
-            base = _complete_recipe(base, find_section(method), has_goals=goal is not None)
-        settings = _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
+    settings: Any = _choose_settings(recipe, method, has_goals=goal is not None) if config is None else config
     settings = with_changes(settings, processes, seed)
     trainer = find_method(settings)
     interval = settings.validation.every if trainer is not None and trainer.validates else 0
@@ -177,18 +171,8 @@ def finetune(
         learner = with_conditioning(learner, conditioning, settings.seed, name=name)
     card = write_card(f"fine-tuned ({describe_method(settings)}{conditioning})", training, policy)
     learner = prepare_policy(learner, settings)
-    return train(
-        learner,
-        training,
-        out,
-        settings,
-        device=device,
-        held_out=held_out,
-        card=card,
-        max_updates=max_updates,
-        on_update=on_update,
-        tracker=tracker,
-    )
+    limits: Any = {"max_updates": max_updates, "on_update": on_update, "tracker": tracker}
+    return train(learner, training, out, settings, device=device, held_out=held_out, card=card, **limits)
 
 
 def find_section(method: str) -> str:
@@ -201,6 +185,19 @@ def find_section(method: str) -> str:
         raise ConfigError("method 'pretrain' has a command of its own: rlftsim pretrain --init-from MODEL.")
     METHODS.get(method)
     return "finetune" if method == "rlft" else method
+
+
+def _choose_settings(recipe: AnyRecipe | None, method: str, *, has_goals: bool) -> Any:
+    """Settings of a method, of a recipe or the paper's.
+
+    Raises:
+        ConfigError: The recipe has none.
+    """
+    base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
+    # a recipe that is handed over has what it should have
+    if not isinstance(recipe, Recipe):
+        base = _complete_recipe(base, find_section(method), has_goals=has_goals)
+    return _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
 
 
 def _complete_recipe(recipe: Recipe, section: str, *, has_goals: bool) -> Recipe:

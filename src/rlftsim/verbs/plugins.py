@@ -61,17 +61,19 @@ def list_plug_ins() -> list[PlugIn]:
 
 
 def describe_failures(entry: EntryPoint) -> str | None:
-    """One line about the rules that rewards of a package break, on two small scenarios; None = they break none."""
+    """One line about the rules that rewards of a package break, on two small scenarios; None = no rule is broken."""
     from rlftsim.rewards import REWARDS  # imported late, with torch: few packages have rewards
     from rlftsim.verbs.check_reward import check_reward
 
-    package = entry.module.partition(".")[0]
-    for name in REWARDS.names():
-        if (getattr(REWARDS.get(name), "__module__", None) or "").partition(".")[0] == package or name == entry.name:
-            failures = check_reward(name).failures
-            if failures:
-                broken = "; ".join(f"{failure.rule}: {failure.detail}" for failure in failures)
-                return f"reward {name!r} of {entry.value} breaks the contract, see rs.check_reward: {broken}."
+    names = [entry.name]
+    if REWARDS.find(entry.name) is None:  # a module that registers rewards by other names
+        modules = {name: getattr(REWARDS.get(name), "__module__", None) or "" for name in REWARDS.names()}
+        names = [name for name, module in modules.items() if module.partition(".")[0] == entry.value.partition(".")[0]]
+    for name in names:
+        failures = check_reward(name).failures
+        if failures:
+            broken = "; ".join(f"{failure.rule}: {failure.detail}" for failure in failures)
+            return f"reward {name!r} of {entry.value} breaks the contract, see rs.check_reward: {broken}."
     return None
 
 

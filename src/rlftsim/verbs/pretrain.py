@@ -125,13 +125,13 @@ def pretrain(
             registered name. It brings its vocabulary (but see --vocabulary) and the settings --model.*; flags change
             those that its weights do not depend on, such as the number of neighbors. Left out: fresh weights.
         processes: Processes that train, in short for --pretrain.device.processes.
-        limit: Number of training scenarios, the first ones; left out, all of them.
+        limit: Number of training scenarios, from the first on; left out, all.
         max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
             weights of a run that never stopped: the learning rate falls as over all epochs, and is still high at an
             early end.
         seed: Seed of the run, in short for --pretrain.seed.
-        seeds: Number of runs that differ in the seed alone, from 0 on: OUT/seed-0, OUT/seed-1 and so on. Their table at
-            the end has the mean with its 95 % interval. In Python the policy of the first run is returned.
+        seeds: Number of runs that differ in the seed alone, from 0 on: OUT/seed-0, OUT/seed-1 and so on. A table at the
+            end has the mean and the 95 % interval. In Python the policy of the first run is returned.
         on_update: Function that is called behind each update with the number of updates done and the metrics by name,
             `f(update, values)`. An error in the function ends the run, which goes on from the last checkpoint.
         split: Split of the data set to train on.
@@ -166,11 +166,8 @@ def pretrain(
     if start is None:
         assert recipe is not None
         fresh = to_recipe(recipe)
-        if seed is not None:  # which the weights are drawn with
-            fresh = replace(fresh, pretrain=settings)
-        if tokens is None and fresh.tokens is not None:
-            tokens = build_vocabulary(training, fresh.tokens)[0]
-        learner: Any = fresh.new_policy(tokens)
+        # weights are drawn with the recipe's seed
+        learner: Any = _make_policy(fresh if seed is None else replace(fresh, pretrain=settings), tokens, training)
         device = get_device(learner)
     else:
         learner, device = load_start(start)
@@ -181,18 +178,15 @@ def pretrain(
             replaced = () if tokens is None else (tokens, keep_tokens)
             learner = like.train_further(learner, *replaced)  # pyright: ignore[reportArgumentType]
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
-    return train(
-        learner,
-        training,
-        out,
-        settings,
-        device=device,
-        held_out=validation,
-        card=card,
-        max_updates=max_updates,
-        on_update=on_update,
-        tracker=tracker,
-    )
+    limits: Any = {"max_updates": max_updates, "on_update": on_update, "tracker": tracker}
+    return train(learner, training, out, settings, device=device, held_out=validation, card=card, **limits)
+
+
+def _make_policy(recipe: Recipe, tokens: Vocabulary | None, training: Scenarios) -> Any:
+    """A policy with fresh weights, and with tokens of the training scenarios where it needs some and there are none."""
+    if tokens is None and recipe.tokens is not None:
+        tokens = build_vocabulary(training, recipe.tokens)[0]
+    return recipe.new_policy(tokens)
 
 
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:

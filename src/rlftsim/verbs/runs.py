@@ -75,7 +75,7 @@ def runs(folders: list[str]) -> list[RunSummary]:
 
     The metric is the RMM of validation where a run has validated; else the RMM of its training rollouts or the loss,
     whose mean over the last tenth of the updates is "last". Values of different data do not compare. Runs of --seeds
-    have their mean in a table of its own.
+    have a further table with the mean.
 
     Args:
         folders: Folders of runs; other files and folders are passed over, if there is a run among them.

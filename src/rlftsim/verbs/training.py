@@ -102,7 +102,7 @@ def train(
 
 
 def repeat_for_seeds(verb: Callable[Parameters, Policy]) -> Callable[Parameters, Policy]:
-    """Decorator of a verb that trains: with `seeds` it runs as often, with a seed and a folder for each.
+    """Decorator of a verb that trains: `seeds` repeats the verb with a seed and a folder for each run.
 
     The policy of the first run is returned.
     """
@@ -117,7 +117,7 @@ def repeat_for_seeds(verb: Callable[Parameters, Policy]) -> Callable[Parameters,
         policies = []
         for seed in range(whole_number("seeds", seeds, 1)):
             changes: Any = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
-            policies.append(verb(**changes))
+            policies.append(verb(**changes))  # pyright: ignore[reportCallIssue]
         return policies[0]
 
     return train_runs
@@ -155,7 +155,7 @@ def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str
 
 
 def with_changes(settings: Any, processes: Any, seed: int | None) -> Any:
-    """Settings of a run on so many processes and with this seed; None leaves either as it is.
+    """Settings of a run on so many processes and with this seed; None changes nothing.
 
     Args:
         settings: Settings of the method.

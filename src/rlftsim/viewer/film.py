@@ -83,11 +83,11 @@ class Camera:
             shapes = agent_shapes(scene.agents, panel, step)
             for shape in shapes:
                 axis.add_collection(shape, autolim=False)
-            drawn: list[Artist] = [*shapes, light_dots(axis, scene, lights_at)]
+            artists: list[Artist] = [*shapes, light_dots(axis, scene, lights_at)]
             if panel.notes:
                 corner = {"transform": axis.transAxes, "va": "top", "bbox": {"color": "white", "alpha": 0.7, "pad": 2}}
-                drawn.append(axis.text(0.02, 0.98, panel.notes[step], fontsize=8, **corner))
-            for shape in drawn:
+                artists.append(axis.text(0.02, 0.98, panel.notes[step], fontsize=8, **corner))
+            for shape in artists:
                 axis.draw_artist(shape)
                 shape.remove()
         pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]

@@ -178,7 +178,7 @@ def film(
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
         raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
-    arguments = rollouts if isinstance(rollouts, list | tuple) else [rollouts]
+    arguments = [rollouts] if isinstance(rollouts, Rollouts) else rollouts
     show(scenario, *arguments, titles=titles).save(path)
     return path
 

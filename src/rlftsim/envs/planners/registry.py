@@ -117,7 +117,7 @@ def _load_sb3(path: str) -> Planner:
     """Planner of a file of Stable-Baselines3.
 
     Raises:
-        ConfigError: The package is missing, or no such file, or another policy than `Sb3Planner` takes.
+        ConfigError: Missing package or file, or a policy that `Sb3Planner` does not take.
     """
     try:
         from rlftsim.envs.planners.sb3 import Sb3Planner  # a package of its own, which few have

@@ -1,15 +1,15 @@
 """Policies that Stable-Baselines3 has learned, as planners: `rlftsim drive sb3:ppo.zip`.
 
-Such a file has pickled objects, and to unpickle one runs whatever code its author put there. So no object of it is read
-but tensors, by torch's restricted reader: the network is built anew from the shapes of the weights, and from the names
-of classes that stand beside the pickles as text.
+Such a file has pickled objects, and unpickling runs whatever code the author put there. So tensors alone are read, by
+torch's restricted reader: the network is built anew from the shapes of the weights, and from the names of classes that
+stand beside the pickles as text.
 """
 
 import io
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -30,14 +30,14 @@ WAY_OUT = "load it in a file of your own with Stable-Baselines3, and name that a
 
 
 class Sb3Planner:
-    """The mean action, or the likeliest one, of a policy that PPO or A2C has learned: "MlpPolicy" on flat observations,
+    """The mean or likeliest action of a policy that PPO or A2C has learned: "MlpPolicy" on flat observations,
     or "MultiInputPolicy" with `DriverView`.
 
     Args:
-        path: File that `model.save` wrote. The type of action follows from the number of its outputs.
+        path: File that `model.save` wrote. The number of outputs tells the type of action.
 
     Raises:
-        ConfigError: No such file, a damaged one, or another kind of policy.
+        ConfigError: Missing or damaged file, or a policy of a different kind.
     """
 
     def __init__(self, path: str):
@@ -58,8 +58,8 @@ class Sb3Planner:
         pattern = re.compile(r"mlp_extractor\.(policy|value)_net\.\d+\.weight")
         widths: dict[str, Any] = {"pi": [], "vf": []}
         for name, value in weights.items():
-            if part := pattern.fullmatch(name):
-                widths["pi" if part[1] == "policy" else "vf"].append(len(value))
+            if layer := pattern.fullmatch(name):
+                widths["pi" if layer[1] == "policy" else "vf"].append(len(value))
         extractor = settings.get("features_extractor_class")
         if extractor not in (None, str(DriverView)):
             raise ValueError(f"features_extractor_class {extractor}")
@@ -68,26 +68,26 @@ class Sb3Planner:
         if not names:
             raise ValueError(f"activation {activation[:60]}")
         policy_class = ActorCriticPolicy if self._is_flat else MultiInputActorCriticPolicy
-        policy = policy_class(
+        spaces: tuple[Any, Any] = (
             observation_space("flat" if self._is_flat else "dict"),
-            action_space(build_controls(self.action, horizon=self.horizon)),
-            lambda progress: 0.0,
-            net_arch=widths,  # pyright: ignore[reportArgumentType]
-            activation_fn=getattr(torch.nn, names[0]),
-            **({} if self._is_flat else {"features_extractor_class": DriverView}),
+            action_space(build_controls(cast("ActionType", self.action), horizon=self.horizon)),
         )
+        arguments: dict[str, Any] = {"net_arch": widths, "activation_fn": getattr(torch.nn, names[0])}
+        if not self._is_flat:
+            arguments["features_extractor_class"] = DriverView
+        policy = policy_class(*spaces, lambda progress: 0.0, **arguments)
         policy.load_state_dict(weights)
         return policy.eval()
 
     def reset(self, info: dict[str, Any]) -> None:
-        """Do nothing: the policy has no memory."""
+        """A policy without memory has no use for the beginning of an episode."""
 
     def act(self, observation: dict[str, Any]) -> Any:
         """Mean action, inside the limits."""
-        seen: Any = observation
+        inputs: Any = observation
         if self._is_flat:
-            seen = np.concatenate([np.ravel(observation[name]) for name in SHAPES]).astype(np.float32)
-        return self._policy.predict(seen, deterministic=True)[0]
+            inputs = np.concatenate([np.ravel(observation[name]) for name in SHAPES]).astype(np.float32)
+        return self._policy.predict(inputs, deterministic=True)[0]
 
 
 def _read_policy(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -106,6 +106,8 @@ def _read_policy(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise ValueError("policy.pth has other values than tensors by name")
     if sum(value.numel() for value in weights.values()) > MAX_BYTES // 4:  # a small file may claim large tensors
         raise ValueError("weights larger than their file")
+    if not all(value.isfinite().all() for value in weights.values()):
+        raise ValueError("a weight is not finite")
     return weights, settings if isinstance(settings, dict) else {}
 
 
@@ -115,7 +117,7 @@ def _find_action(weights: dict[str, Tensor]) -> tuple[ActionType, int]:
     if "log_std" not in weights and count == build_controls("bicycle_discrete").num_choices:
         return "bicycle_discrete", MIN_HORIZON
     if "log_std" in weights and count in (2, 3):
-        return ("bicycle", "pose")[count - 2], MIN_HORIZON
+        return "bicycle" if count == 2 else "pose", MIN_HORIZON
     if "log_std" in weights and count % 3 == 0 and count >= 3 * MIN_HORIZON:
         return "trajectory", count // 3
     raise ValueError(f"{count} outputs are no type of action")
