@@ -34,6 +34,8 @@ DOWNLOADS = "_to_tables.py"
 """End of the names of scripts that readers take from the site."""
 REFERENCE = "docs/reference/"
 """Where links look for the reference, which is no file of the repository; the builder finds dead ones."""
+LAST_IN_SEARCH = "---\nsearch:\n  boost: 0.1\n---\n"
+"""Front matter of measurements and of the log, which have every word often."""
 TEMPLATE = ROOT / "docs" / "plugin_template"
 SHIM = "https://unpkg.com/iframe-worker/shim"
 """Script of another host that the builders name in every page; docs/assets has one of our own in its place."""
@@ -132,7 +134,7 @@ def stage() -> None:
             if place.startswith("tutorials/") and path.name != "index.md":
                 nbformat.write(notebook_of(path, base), target.with_suffix(".ipynb"))
                 text += f"\n[This page as a notebook]({path.stem}.ipynb)\n"
-            target.write_text(text)
+            target.write_text(LAST_IN_SEARCH + text if place.startswith("results/") or place == "log.md" else text)
         else:
             shutil.copyfile(path, target)
     write_reference.write_pages(PAGES / "reference")

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -242,6 +243,11 @@ PIECES = (
 )  # fmt: skip
 
 
+def break_lines(command: str) -> str:
+    """A command in lines of at most 80 characters."""
+    return " \\\n    ".join(textwrap.wrap(command, 74, break_long_words=False, break_on_hyphens=False))
+
+
 def gallery_text() -> str:
     """The page of the gallery, Markdown."""
     parts = [
@@ -254,7 +260,7 @@ def gallery_text() -> str:
     for piece in PIECES:
         alternative = f"Film of {piece.title[0].lower()}{piece.title[1:]}" if piece.is_film else piece.title
         play = f" [Open in the player](gallery/{piece.name}.html)." if (GALLERY / f"{piece.name}.html").exists() else ""
-        commands = "\n".join(piece.commands)
+        commands = "\n".join(map(break_lines, piece.commands))
         parts += [
             f"## {piece.title}", f"{piece.text}{play}",
             f"![{alternative}](gallery/{piece.name}.webp)",
@@ -274,37 +280,41 @@ def write_film(path: Path) -> None:
 
 
 def write_demo(path: Path) -> None:
-    """Page of the held-out scenarios with the fewest map points, each logged and simulated by two models."""
+    """Page of the held-out scenarios with the fewest map points, each logged and simulated by two models; that in which
+    the second gains most comes first."""
     data = rs.load_dataset("synthetic", "validation")
     chosen = sorted(range(len(data)), key=lambda i: data.index["num_map_points"][i].as_py())[:NUM_SCENARIOS]
-    animations = []
+    animations: list[tuple[float, Animation]] = []
     for scenario in data[chosen]:
         scene = build_scene(scenario)
-        panels, scores = [Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents))], []
+        panels, scores = [Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents))], {}
         for name, model in VARIANTS.items():
             rollouts = Simulated(model).rollouts(scenario, NUM_ROLLOUTS)
             motion = rollout_trajectories(scenario, rollouts, row=0, max_rollouts=SHOWN_ROLLOUTS)
             panels.append(Panel(name, motion.with_overlaps(scene.agents)))
-            scores.append(f"{name}: {rs.score(scenario, rollouts)}")
-        title = f"Scenario {scenario.scenario_id}"
-        animations.append(Animation(title, scene, panels, caption=". ".join(scores)))
+            scores[name] = rs.score(scenario, rollouts)
+        title, caption = f"Scenario {scenario.scenario_id}", ". ".join(f"{name}: {s}" for name, s in scores.items())
+        base, tuned = (float(score.meta_metric) for score in scores.values())
+        animations.append((tuned - base, Animation(title, scene, panels, caption=caption)))
     caption = (
-        f"The {NUM_SCENARIOS} of {len(data)} held-out synthetic scenarios with the smallest maps, the first "
-        f"{SHOWN_ROLLOUTS} of {NUM_ROLLOUTS} rollouts. Scores are of all {NUM_ROLLOUTS}, metric 2025; synthetic "
-        "traffic says nothing about real traffic."
+        f"The {NUM_SCENARIOS} of {len(data)} held-out synthetic scenarios with the smallest maps, the largest gain "
+        f"first, and the first {SHOWN_ROLLOUTS} of {NUM_ROLLOUTS} rollouts. Scores are of all {NUM_ROLLOUTS}, metric "
+        "2025; synthetic traffic says nothing about real traffic."
     )
-    write_page(path, "Six scenarios, simulated in advance", animations, caption=caption)
+    shown = [animation for _, animation in sorted(animations, key=lambda entry: -entry[0])]
+    write_page(path, "Six scenarios, simulated in advance", shown, caption=caption)
 
 
 def read_gains() -> list[tuple[str, float, float, float]]:
-    """Label, difference in RMM and its interval of each row of the table in docs/results.md."""
-    table = (DOCS / "results.md").read_text().replace("−", "-")
+    """Label, difference in RMM and its interval of each row of the tables in docs/results.md."""
+    text = (DOCS / "results.md").read_text().replace("−", "-")
     number = r"([+-][\d.]+)"
-    rows = re.findall(rf"^\| (.+?) \| (.+?) × \d+ \| .+? \| {number} \[{number}, {number}\]", table, re.MULTILINE)
-    return [
-        (f"{method.replace('`', '')}: {data}", float(gain), float(low), float(high))
-        for method, data, gain, low, high in rows
-    ]
+    gains = []
+    for table in re.split(r"^\*\*", text, flags=re.MULTILINE)[1:]:
+        data = table.partition(" scenarios × ")[0]
+        for method, *values in re.findall(rf"^\| (.+?) \| .+? \| {number} \[{number}, {number}\]", table, re.MULTILINE):
+            gains.append((f"{method.replace('`', '')}: {data}", *map(float, values)))
+    return gains
 
 
 def draw_gains(path: Path) -> None:

@@ -8,6 +8,7 @@ import ast
 import contextlib
 import math
 import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -148,6 +149,20 @@ def test_blocks_have_a_language_and_files_are_used():
         for block in blocks:
             uses = "".join(other.text for other in blocks if other is not block)
             assert block.title is None or Path(block.title).stem in uses, block
+
+
+def test_commands_fit_into_80_characters():
+    """A single word that is longer stays whole."""
+    lines = [
+        (str(block), line)
+        for page in PAGES
+        for block in blocks_of(page)
+        for line in block.text.splitlines()
+        if block.language == "sh"
+    ]
+    assert [
+        (block, line) for block, line in lines if len(line) > 80 and len(shlex.split(line, comments=True)) > 1
+    ] == []
 
 
 def test_every_tutorial_shows_what_it_prints():

@@ -1,6 +1,7 @@
 """Pictures of the site: the gallery is what its script writes, all are small, and the chart shows the table."""
 
 import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -35,8 +36,19 @@ def test_there_are_twelve_pieces_of_400_kilobytes_at_most_and_films_have_a_page_
 def test_the_chart_of_the_results_has_a_mark_for_every_row_of_the_table(pictures, tmp_path):
     gains = pictures.read_gains()
     table = (DOCS / "results.md").read_text().partition("<!-- measured:begin -->")[2].partition("<!-- measured:end")[0]
-    assert 1 < len(gains) == table.count("\n|") - 2 <= 8
+    assert table.count("\n|---|") == 3
+    assert 1 < len(gains) == table.count("\n|") - 2 * 3 <= 8
+    assert all(line.count(" | ") == 4 for line in table.splitlines() if line.startswith("| "))
     assert all(low < gain < high for _, gain, low, high in gains)
     pictures.draw_gains(tmp_path / "chart.webp")
     with Image.open(tmp_path / "chart.webp") as drawn, Image.open(DOCS / "results.webp") as shown:
         assert drawn.size == shown.size
+
+
+def test_the_live_demo_opens_on_the_scenario_that_gained_most():
+    page = (DOCS / "demo" / "live.html").read_text()
+    scores = [float(score) for score in re.findall(r"demo-(?:base|tuned): RMM (0\.\d+)", page)]
+    gains = [tuned - base for base, tuned in zip(scores[::2], scores[1::2])]
+    assert len(gains) == 6
+    assert gains == sorted(gains, reverse=True)
+    assert gains[0] > 0

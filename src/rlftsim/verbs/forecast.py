@@ -1,0 +1,222 @@
+"""Forecast of a training: the real command, stopped after a few updates, and again on the largest scenarios alone."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from rich.table import Table
+
+from rlftsim.errors import ConfigError, DataError, shorten
+from rlftsim.jobs.progress import log
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.scenario.open import open_dataset
+from rlftsim.training.parallel import scenario_costs
+from rlftsim.training.run_folder import flatten, read_metrics, stored_settings
+
+WARM_UP = 1
+"""Updates that are not counted: they import, and fill caches."""
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""Bytes that a container may use; "max" = no limit."""
+SECONDS_BETWEEN_LOOKS = 0.05
+
+
+@dataclass(frozen=True)
+class TrainingCommand:
+    """A command line of a training that is to be forecast."""
+
+    verb: Literal["finetune", "pretrain"]
+    recipe: str
+    model: str | None
+    """Model to fine-tune, or to train further; None = fresh weights."""
+    data: str
+    vocabulary: str | None = None
+    config: str | None = None
+    """File of settings."""
+
+    def write_words(self, data: str | Path, out: Path, micro_batch: int | None = None) -> list[str]:
+        """Words of the command line.
+
+        Args:
+            data: Data set to train on.
+            out: Folder of the run.
+            micro_batch: Scenarios in memory at once; None = as the settings say.
+        """
+        words = [self.verb, self.recipe, "--data", str(data), "--out", str(out)]
+        model_flag = "--model" if self.verb == "finetune" else "--init-from"
+        for flag, value in ((model_flag, self.model), ("--vocabulary", self.vocabulary), ("--config", self.config)):
+            words += [flag, value] if value is not None else []
+        return words + ([f"--{self.verb}.micro-batch-size", str(micro_batch)] if micro_batch else [])
+
+
+@dataclass(frozen=True)
+class MeasuredRun:
+    """What a run took until it was stopped."""
+
+    seconds: float
+    """Of an update, mean over those behind the first."""
+    peak_bytes: int
+    """Largest memory of a process."""
+    settings: dict[str, object]
+
+
+@dataclass(frozen=True)
+class TrainingForecast:
+    """Time and memory of a training on this machine."""
+
+    num_updates: int
+    seconds: float
+    """Of an update."""
+    num_measured: int
+    processes: int
+    micro_batch: int
+    """Scenarios in memory at once, as the settings say, over all processes."""
+    peak_bytes: int
+    """Of all processes, with the largest scenarios."""
+    fitting_micro_batch: int
+    """Largest one that fits, up to the batch; 0 = none."""
+    available_bytes: int
+
+
+def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingForecast:
+    """Forecast of a training.
+
+    Args:
+        command: Training to forecast.
+        num_measured: Number of updates to measure.
+
+    Raises:
+        ConfigError, DataError: The command itself fails, with the same message; or it cannot fit into memory.
+    """
+    dataset = open_dataset(command.data, "training")
+    available = find_memory()
+    with tempfile.TemporaryDirectory(prefix="rlftsim-") as temporary:
+        folder = Path(temporary)
+        log.info(f"measure {num_measured} updates")
+        run = measure_run(command.write_words(command.data, folder / "run"), folder / "run", WARM_UP + num_measured)
+        batch_size, micro_batch = (int(str(run.settings[name])) for name in ("batch_size", "micro_batch_size"))
+        processes = int(str(run.settings["device.processes"]))
+        log.info("measure the largest scenarios")
+        largest = write_largest(dataset, batch_size, folder / "largest")
+        sizes = dict.fromkeys((min(micro_batch, batch_size), processes))
+        peaks = {
+            size: processes * measure_run(command.write_words(largest, out, size), out, 1).peak_bytes
+            for size, out in ((size, folder / f"micro-{size}") for size in sizes)
+        }
+    peak, lowest = peaks[min(micro_batch, batch_size)], peaks[processes]
+    fitting = find_fitting_micro_batch(peaks, available, batch_size)
+    if not fitting:
+        raise DataError(
+            f"{command.verb} {command.recipe} cannot fit: at the least micro batch the largest scenarios need "
+            f"{lowest / 1e9:.1f} GB of this machine's {available / 1e9:.1f}: take fewer processes, or a smaller model."
+        )
+    epochs = float(str(run.settings["epochs"]))
+    num_updates = max(math.ceil(epochs * len(dataset) / batch_size), 1)
+    return TrainingForecast(
+        num_updates, run.seconds, num_measured, processes, micro_batch, peak, fitting, available
+    )  # fmt: skip
+
+
+def measure_run(words: list[str], out: Path, num_updates: int) -> MeasuredRun:
+    """Run a training in a process of its own until some updates are done.
+
+    Args:
+        words: Command line without the name of the program.
+        out: Folder of the run.
+        num_updates: Number of updates to wait for; fewer where the run is shorter.
+
+    Raises:
+        ConfigError: The command fails, with its message.
+        DataError: The process was killed, as by a machine that is out of memory.
+    """
+    with tempfile.TemporaryFile("w+") as errors:
+        command = [sys.executable, "-m", "rlftsim", *words]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
+        is_stopped, moments = False, []
+        while True:
+            done, status, usage = os.wait4(process.pid, os.WNOHANG)
+            num_done = len(read_metrics(out)) if out.exists() else 0
+            moments += [time.monotonic()] * (num_done - len(moments))
+            if done:
+                break
+            if num_done >= num_updates and not is_stopped:
+                is_stopped = True
+                process.send_signal(signal.SIGTERM)
+            time.sleep(SECONDS_BETWEEN_LOOKS)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode == -signal.SIGKILL:
+            raise DataError(f"{' '.join(words)}: was killed, as where memory ends: take a smaller micro batch.")
+        if process.returncode and not is_stopped:
+            errors.seek(0)
+            lines = errors.read().strip().splitlines() or ["no message"]
+            raise ConfigError(f"{words[0]} cannot be forecast: {shorten(lines[-1].removeprefix('rlftsim: '))}")
+    moments = moments[:num_updates]
+    seconds = (moments[-1] - moments[0]) / (len(moments) - 1) if len(moments) > 1 else math.nan
+    return MeasuredRun(seconds, usage.ru_maxrss * 1024, flatten(stored_settings(out)))
+
+
+def write_largest(dataset: ScenarioDataset, count: int, folder: Path) -> Path:
+    """Write a data set of the largest scenarios, all of the split training. Returns its folder.
+
+    Args:
+        dataset: Scenarios to choose from.
+        count: Number of scenarios.
+        folder: Folder to write.
+    """
+    order = np.argsort(-scenario_costs(dataset), kind="stable")[:count]
+    write_dataset((dataset[int(position)] for position in order), folder, split="training")
+    return folder
+
+
+def find_fitting_micro_batch(peaks: dict[int, int], available: int, most: int) -> int:
+    """Largest micro batch whose memory fits, on the line through two measurements; 0 where the smaller does not fit.
+
+    Args:
+        peaks: Peak memory in bytes, by micro batch: one measurement or two.
+        available: Memory of the machine, in bytes.
+        most: Scenarios of an update, the largest micro batch that makes sense.
+    """
+    smaller, larger = min(peaks), max(peaks)
+    if peaks[smaller] > available:
+        return 0
+    slope = (peaks[larger] - peaks[smaller]) / (larger - smaller) if larger > smaller else 0.0
+    if slope <= 0:
+        return most if peaks[larger] <= available else smaller
+    return max(min(math.floor(smaller + (available - peaks[smaller]) / slope), most), smaller)
+
+
+def find_memory() -> int:
+    """Memory of this machine in bytes, within the limit of the container."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limit = CGROUP_LIMIT.read_text().strip() if CGROUP_LIMIT.is_file() else "max"
+    return min(memory, int(limit)) if limit.isdecimal() else memory
+
+
+def training_table(command: TrainingCommand, forecast: TrainingForecast) -> Table:
+    """Updates, time, memory and a micro batch that fits.
+
+    Args:
+        command: Training that was forecast.
+        forecast: Time and memory.
+    """
+    table = Table(
+        title=f"{command.verb} {command.recipe} on this machine, {forecast.processes} processes",
+        caption="without validations and the start; a GPU's own memory is not measured",
+        show_header=False, title_justify="left", caption_justify="left",
+    )  # fmt: skip
+    needed, available = (value / 1e9 for value in (forecast.peak_bytes, forecast.available_bytes))
+    fits = "" if needed <= available else ", which does not fit"
+    total = forecast.num_updates * forecast.seconds
+    table.add_row("updates", str(forecast.num_updates))
+    table.add_row("an update", f"{forecast.seconds:.3g} s (mean of {forecast.num_measured})")
+    table.add_row("in all", f"{total:.0f} s" if total < 120 else f"{total / 60:.0f} min")
+    table.add_row("peak memory", f"{needed:.1f} GB of {available:.1f} GB, with the largest scenarios{fits}")
+    table.add_row("micro batch", f"{forecast.micro_batch} as set; up to {forecast.fitting_micro_batch} fit")
+    return table
