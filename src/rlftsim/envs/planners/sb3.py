@@ -43,6 +43,7 @@ class Sb3Planner:
     def __init__(self, path: str):
         try:
             weights, settings = _read_policy(Path(path))
+            self.action: ActionType
             self.action, self.horizon = _find_action(weights)
             self._is_flat = "features_extractor_class" not in settings
             self._policy = self._build_policy(weights, settings)
@@ -67,12 +68,12 @@ class Sb3Planner:
         names = [name for name in ACTIVATIONS if activation.endswith(f".{name}'>")]
         if not names:
             raise ValueError(f"activation {activation[:60]}")
-        policy_class = ActorCriticPolicy if self._is_flat else MultiInputActorCriticPolicy
+        policy_class: Any = ActorCriticPolicy if self._is_flat else MultiInputActorCriticPolicy
         policy = policy_class(
             observation_space("flat" if self._is_flat else "dict"),
             action_space(build_controls(self.action, horizon=self.horizon)),
             lambda progress: 0.0,
-            net_arch=widths,  # pyright: ignore[reportArgumentType]
+            net_arch=widths,
             activation_fn=getattr(torch.nn, names[0]),
             **({} if self._is_flat else {"features_extractor_class": DriverView}),
         )
@@ -117,7 +118,7 @@ def _find_action(weights: dict[str, Tensor]) -> tuple[ActionType, int]:
     if "log_std" not in weights and count == build_controls("bicycle_discrete").num_choices:
         return "bicycle_discrete", MIN_HORIZON
     if "log_std" in weights and count in (2, 3):
-        return ("bicycle", "pose")[count - 2], MIN_HORIZON
+        return "bicycle" if count == 2 else "pose", MIN_HORIZON
     if "log_std" in weights and count % 3 == 0 and count >= 3 * MIN_HORIZON:
         return "trajectory", count // 3
     raise ValueError(f"{count} outputs are no type of action")
