@@ -42,7 +42,7 @@ def write_film(board: "SummaryWriter", frames: Sequence[np.ndarray], step: int, 
         step: Number of updates done.
         frame_s: Seconds that a frame stays.
     """
-    from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
+    from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue] (generated)
 
     film, (first, *later) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
     first.save(film, format="GIF", save_all=True, append_images=later, duration=round(1000 * frame_s), loop=0)

@@ -93,7 +93,7 @@ def train(
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
     policy.eval().requires_grad_(False).to(device)
-    if out is not None and "tensorboard" in trackers and is_first_process():
+    if out is not None and "tensorboard" in trackers and is_first_process() and isinstance(policy, Policy):
         with suppress(RlftsimError, OSError):  # a picture is no reason to lose a model
             film_model(Path(out), policy, (options["held_out"] or scenarios)[0])
     if out is not None:
@@ -116,8 +116,8 @@ def repeat_for_seeds(verb: Callable[Parameters, Policy]) -> Callable[Parameters,
             raise ConfigError(f"seeds={seeds}: several runs need a folder for theirs, out, and each has its seed.")
         policies = []
         for seed in range(whole_number("seeds", seeds, 1)):
-            changes: Any = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
-            policies.append(verb(**changes))  # pyright: ignore[reportCallIssue]
+            changes = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
+            policies.append(verb(**changes))  # pyright: ignore[reportCallIssue] (the same arguments by name)
         return policies[0]
 
     return train_runs

@@ -9,7 +9,7 @@ import io
 import re
 import zipfile
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,6 +43,7 @@ class Sb3Planner:
     def __init__(self, path: str):
         try:
             weights, settings = _read_policy(Path(path))
+            self.action: ActionType
             self.action, self.horizon = _find_action(weights)
             self._is_flat = "features_extractor_class" not in settings
             self._policy = self._build_policy(weights, settings)
@@ -67,15 +68,15 @@ class Sb3Planner:
         names = [name for name in ACTIVATIONS if activation.endswith(f".{name}'>")]
         if not names:
             raise ValueError(f"activation {activation[:60]}")
-        policy_class = ActorCriticPolicy if self._is_flat else MultiInputActorCriticPolicy
-        spaces: tuple[Any, Any] = (
+        policy_class: Any = ActorCriticPolicy if self._is_flat else MultiInputActorCriticPolicy
+        policy = policy_class(
             observation_space("flat" if self._is_flat else "dict"),
-            action_space(build_controls(cast("ActionType", self.action), horizon=self.horizon)),
+            action_space(build_controls(self.action, horizon=self.horizon)),
+            lambda progress: 0.0,
+            net_arch=widths,
+            activation_fn=getattr(torch.nn, names[0]),
+            **({} if self._is_flat else {"features_extractor_class": DriverView}),
         )
-        arguments: dict[str, Any] = {"net_arch": widths, "activation_fn": getattr(torch.nn, names[0])}
-        if not self._is_flat:
-            arguments["features_extractor_class"] = DriverView
-        policy = policy_class(*spaces, lambda progress: 0.0, **arguments)
         policy.load_state_dict(weights)
         return policy.eval()
 
