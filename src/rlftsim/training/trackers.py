@@ -1,7 +1,7 @@
-"""Trackers: programs that show a run while it trains. They are called at the end of an update, never inside one.
+"""Trackers: programs that show a run while the run trains, called at the end of each update.
 
-A tracker that fails, takes too long or is not installed costs the run a warning, and nothing else. Names are those in
-`TRACKERS`, or `package.module:Class`. A package of your own adds a name with an entry point:
+A tracker that fails, takes too long or is not installed costs a warning. Names are those in `TRACKERS`, or
+`package.module:Class`. A package of your own adds a name with an entry point:
 
 [project.entry-points."rlftsim.trackers"]
 mine = "my_package:MyTracker"
@@ -48,12 +48,12 @@ class Tracker(Protocol):
     """Receives the metrics of a run. Made without arguments; all calls come from the same thread."""
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str | None:
-        """Begin a run, or go on with one; returns an id that is handed over as `resume` next time.
+        """Begin a run, or continue a run; returns an id that a later call gets as `resume`.
 
         Args:
             run: Folder of the run.
             config: Settings and inputs of the run by name, names with dots for groups.
-            resume: Id of the run that is continued; None = a new run.
+            resume: Id that an earlier call returned for the run; None = a new run.
         """
         ...
 
@@ -70,7 +70,7 @@ class Tracker(Protocol):
         """Add a result of the run.
 
         Args:
-            path: Folder of files.
+            path: Folder of the files, such as the trained model's.
             kind: Word for the content, "model".
         """
         ...
@@ -84,7 +84,7 @@ class TensorBoardTracker:
     """Events in the folder `tensorboard` of the run."""
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> None:
-        """Nothing but the folder is noted."""
+        """The folder of the events is noted."""
         self._folder, self._board = os.path.join(run, "tensorboard"), None
 
     def log(self, values: Mapping[str, float], step: int) -> None:
@@ -97,7 +97,7 @@ class TensorBoardTracker:
             self._board.add_scalar(board_tag(name), value, step)
 
     def artifact(self, path: str, kind: str) -> None:
-        """Nothing: TensorBoard shows no files."""
+        """No file is kept: TensorBoard shows none."""
 
     def finish(self, status: Status) -> None:
         """Pending events are written."""
@@ -110,7 +110,7 @@ class WandbTracker:
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
         """The id of the run there."""
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         project = os.environ.get("WANDB_PROJECT", PROJECT)
         self._run = wandb.init(
@@ -124,7 +124,7 @@ class WandbTracker:
 
     def artifact(self, path: str, kind: str) -> None:
         """An artifact of the run."""
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
         artifact = wandb.Artifact(f"{kind}-{self._run.id}", kind)
         artifact.add_dir(path)
@@ -140,7 +140,7 @@ class MlflowTracker:
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
         """The id of the run there."""
-        import mlflow
+        import mlflow  # pyright: ignore[reportMissingImports]
 
         self._mlflow = mlflow
         mlflow.set_experiment(os.environ.get("MLFLOW_EXPERIMENT_NAME", PROJECT))
@@ -167,7 +167,7 @@ class TrackioTracker:
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
         """The name of the run there, which differs from those of other runs."""
-        import trackio
+        import trackio  # pyright: ignore[reportMissingImports]
 
         name = resume or f"{Path(run).name}-{uuid.uuid4().hex[:8]}"
         self._run = trackio.init(
@@ -181,7 +181,7 @@ class TrackioTracker:
         self._run.log(dict(values), step=step)
 
     def artifact(self, path: str, kind: str) -> None:
-        """Nothing: models stay in the folder of the run."""
+        """No file is kept: models stay in the folder of the run."""
 
     def finish(self, status: Status) -> None:
         """Pending rows are written."""
@@ -233,7 +233,7 @@ class RunTrackers:
     """Trackers of a run, begun on construction. A tracker that fails raises no error here.
 
     Args:
-        names: Names of trackers.
+        names: Names in `TRACKERS`, or "package.module:Class".
         folder: Folder of the run, which keeps the ids of the run in the trackers.
         config: Settings and inputs of the run, by name.
     """
@@ -255,7 +255,7 @@ class RunTrackers:
         """Hand over the metrics of an update.
 
         Args:
-            values: Numbers by name.
+            values: Numbers by name, as in metrics.jsonl.
             step: Number of updates done.
         """
         for thread in self._threads.values():
