@@ -1,4 +1,4 @@
-"""Rollouts as JSON files that GPUDrive, PufferDrive and their viewers read."""
+"""Rollouts as JSON files for GPUDrive, PufferDrive and the viewers of both."""
 
 import json
 from collections import defaultdict

@@ -41,7 +41,7 @@ def write_hub_card(
             f"{url}: the card names no terms of some of the data that the weights have seen, and these hold for the "
             'weights, too: train on a data set with a license note, or write "* terms of the data: ..." there.'
         )
-    fixed = [chosen for words, chosen in _LICENSES.items() if any(words in text for text in terms)]
+    fixed = [fixed_id for words, fixed_id in _LICENSES.items() if any(words in text for text in terms)]
     is_waymo = "other" in fixed
     if is_waymo and not i_comply:
         raise ConfigError(
@@ -49,12 +49,12 @@ def write_hub_card(
             "derived from the data: non-commercial use alone, and recipients who are bound by it. Read its terms on "
             "distribution (waymo.com/open/terms), and add --i-comply if this is in keeping with them."
         )
-    chosen = fixed[0] if fixed else license
-    if chosen is None:
+    license_id = fixed[0] if fixed else license
+    if license_id is None:
         raise ConfigError(f"{url}: add --license, such as cc-by-4.0, in keeping with: {' '.join(dict.fromkeys(terms))}")
-    if license not in (None, chosen):
-        raise ConfigError(f"{url}: --license {license} contradicts the terms of the data, {chosen}: leave it out.")
-    header: dict[str, Any] = {"license": chosen, **(_WAYMO if is_waymo else {})}
+    if license not in (None, license_id):
+        raise ConfigError(f"{url}: --license {license} contradicts the terms of the data, {license_id}: leave it out.")
+    header: dict[str, Any] = {"license": license_id, **(_WAYMO if is_waymo else {})}
     header |= {"library_name": "rlftsim", "tags": ["traffic-simulation"]}
     if evaluation is not None:
         header["model-index"] = [{"name": url.rpartition("/")[2], "results": [_describe_scores(evaluation)]}]
@@ -70,7 +70,7 @@ def read_evaluation(path: Path, policy: Policy) -> Evaluation:
         policy: Policy that must have been evaluated.
 
     Raises:
-        ConfigError: It is of another policy.
+        ConfigError: An evaluation of other weights.
         DataError: A damaged file, or none.
     """
     evaluation = Evaluation.read(path)

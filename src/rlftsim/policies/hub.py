@@ -1,7 +1,6 @@
 """Models at Hugging Face: hf://USER/NAME, or hf://USER/NAME@REVISION for the same bits later, also without a network.
 
-Weights are safetensors; no file of another kind than a model folder's is downloaded or uploaded. Credentials are found
-by the library itself.
+Only files of model folders are downloaded and uploaded, weights as safetensors. huggingface_hub finds the credentials.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,11 +24,11 @@ def is_hub_url(name: object) -> bool:
 
 @cache
 def pull_model(url: str) -> Path:
-    """Folder of a model, downloaded once; its name is the commit.
+    """Folder of a model, named after the commit and downloaded once.
 
     Raises:
-        ConfigError: huggingface_hub is not installed, or an address of something else.
-        DataError: No such model or revision, or no network or no right to it.
+        ConfigError: huggingface_hub is not installed, or no address of a model.
+        DataError: No such model or revision, no network, or no right to read there.
         CheckpointError: The repository holds no model folder.
     """
     repository, _, revision = url.removeprefix(PROTOCOL).partition("@")
@@ -48,7 +47,7 @@ def pull_model(url: str) -> Path:
 
 
 def pin_model(name: Any) -> Any:
-    """The address of a model at Hugging Face with its commit; all other names unchanged."""
+    """The address of a model at Hugging Face with the commit; all other names unchanged."""
     return f"{name.partition('@')[0]}@{pull_model(name).name}" if is_hub_url(name) else name
 
 
@@ -60,7 +59,7 @@ def push_files(url: str, files: Mapping[str, Path | bytes]) -> str:
         files: Paths on this machine, or contents, by name.
 
     Raises:
-        ConfigError: huggingface_hub is not installed, or an address of something else.
+        ConfigError: huggingface_hub is not installed, or no address of a model.
         DataError: No network, or no right to write there.
     """
     repository = url.removeprefix(PROTOCOL)
@@ -78,7 +77,7 @@ def _open_hub(url: str, repository: str) -> Iterator[Any]:
     if not is_hub_url(url) or repository.count("/") != 1 or not all(repository.split("/")):
         raise ConfigError(f"{url} is no address of a model: write hf://USER/NAME, or hf://USER/NAME@REVISION to load.")
     try:
-        import huggingface_hub
+        import huggingface_hub  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ConfigError(f'{url}: hf:// needs another library: pip install "rlftsim[hf]".') from None
     try:

@@ -7,7 +7,6 @@ The data have no box sizes and no heights of tracks: both are guessed, and `Scen
 signs and speed limits are missing in the data and in the scenarios.
 """
 
-import glob
 import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -21,7 +20,7 @@ from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
 from rlftsim.scenario.rows import Rows, Schema, read_rows
-from rlftsim.scenario.source import BytesRead, Item, Tally, Unit
+from rlftsim.scenario.source import BytesRead, Item, Tally, Unit, list_files
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
     CURRENT_STEP,
@@ -164,9 +163,7 @@ class Av2Source:
 
 def find_files(path: str | os.PathLike[str]) -> list[Path]:
     """Parquet files of scenarios at a path, by id: a file, a folder with its subfolders, or a glob of either."""
-    paths = [path] if os.path.exists(path) else glob.glob(str(path), recursive=True)
-    matches = [match for path in map(Path, paths) for match in (path.rglob("*") if path.is_dir() else [path])]
-    files = {file for file in matches if file.name.startswith("scenario_") and file.suffix == ".parquet"}
+    files = [path for path in list_files(path) if path.name.startswith("scenario_") and path.suffix == ".parquet"]
     return sorted(files, key=lambda file: (_parse_id(file), str(file)))
 
 

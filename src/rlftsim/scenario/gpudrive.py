@@ -1,11 +1,10 @@
 """GPUDrive, PufferDrive and Nocturne: a JSON file for each scenario, made from the Waymo Open Motion Dataset.
 
-Keys tell three forms apart. The present one has `metadata`, with the ego and the tracks to predict. An early one has
-none, no ids of objects, and headings in degrees that are not wrapped. That of Nocturne has no `scenario_id`, no heights
-and no sub-types of roads either. What a form lacks is guessed, and `Scenario.guessed` says so.
+Keys tell three forms apart. The present form has `metadata`, with the ego and the tracks to predict. The early form has
+no metadata, no ids of objects, and headings in degrees that are not wrapped. The form of Nocturne has no `scenario_id`,
+no heights and no sub-types of roads either. Missing values are guessed, see `Scenario.guessed`.
 """
 
-import glob
 import gzip
 import os
 from collections import defaultdict
@@ -21,7 +20,7 @@ from jaxtyping import Float64
 from rlftsim.errors import DataError, in_short
 from rlftsim.geometry import wrapped
 from rlftsim.jobs.documents import read_json
-from rlftsim.scenario.source import BytesRead, Item, Tally, Unit, infer_split
+from rlftsim.scenario.source import BytesRead, Item, Tally, Unit, infer_split, list_files
 from rlftsim.scenario.tables import choose_predicted
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
@@ -108,7 +107,7 @@ class GpudriveSource:
             yield BytesRead(file.stat().st_size)
 
     def describe(self) -> dict[str, object]:
-        """What all forms lack; what some lack is in `Scenario.guessed`."""
+        """Values that all forms lack; those that some forms lack are in `Scenario.guessed`."""
         missing = ["links between lanes", "speed limits", "lanes of stop signs"]
         guessed = ["size: that of the last valid step", "timestamps: 0.1 s apart"]
         return {"gpudrive": {"guessed": guessed, "missing": missing, "dropped": ["goalPosition", "mark_as_expert"]}}
@@ -116,9 +115,7 @@ class GpudriveSource:
 
 def find_files(path: str | os.PathLike[str]) -> list[Path]:
     """JSON files at a path, by path: a file, a folder with its subfolders, or a glob of either."""
-    paths = [path] if os.path.exists(path) else glob.glob(str(path), recursive=True)
-    matches = [match for path in map(Path, paths) for match in (path.rglob("*") if path.is_dir() else [path])]
-    return sorted({file for file in matches if file.name.endswith(SUFFIXES) and file.is_file()})
+    return sorted(file for file in list_files(path) if file.name.endswith(SUFFIXES) and file.is_file())
 
 
 def _read_head(file: Path) -> bytes:
@@ -144,10 +141,10 @@ def read_scenario(file: Path) -> tuple[Scenario, str, int]:
     if form == "present":
         metadata = _get(values, "metadata", dict, "the file")
         num_tracks, named = len(tracks.valid), "tracks_to_predict"
-        ego = _to_whole(metadata.get("sdc_track_index"), "sdc_track_index", num_tracks)
+        ego = _to_integer(metadata.get("sdc_track_index"), "sdc_track_index", num_tracks)
         entries = _get(metadata, named, list, "metadata")
-        predicted = [_to_whole(_get(entry, "track_index", int, named), named, num_tracks) for entry in entries]
-        difficulty = [_to_whole(_get(entry, "difficulty", int, named), "difficulty", 128) for entry in entries]
+        predicted = [_to_integer(_get(entry, "track_index", int, named), named, num_tracks) for entry in entries]
+        difficulty = [_to_integer(_get(entry, "difficulty", int, named), "difficulty", 128) for entry in entries]
         interest = _get(metadata, "objects_of_interest", list, "metadata")
     else:
         guessed |= {"ego", "predict"}
@@ -167,7 +164,7 @@ def read_scenario(file: Path) -> tuple[Scenario, str, int]:
         ego_index=ego,
         tracks_to_predict=np.array(predicted, np.int32),
         difficulty=np.array(difficulty, np.int8),
-        objects_of_interest=np.array([_to_whole(value, "objects_of_interest") for value in interest], np.int64),
+        objects_of_interest=np.array([_to_integer(value, "objects_of_interest") for value in interest], np.int64),
         source="gpudrive",
         guessed=frozenset(guessed),
     )
@@ -183,7 +180,7 @@ def _read_tracks(objects: list[Any], *, has_degrees: bool) -> tuple[Tracks, bool
     ids, types, valid, states, sizes, num_off = [], [], [], [], [], 0
     for index, entry in enumerate(objects):
         owner = f"object {index}"
-        ids.append(_to_whole(entry.get("id", index) if isinstance(entry, dict) else None, f"{owner}: id"))
+        ids.append(_to_integer(entry.get("id", index) if isinstance(entry, dict) else None, f"{owner}: id"))
         name = _get(entry, "type", str, owner)
         if name not in OBJECT_TYPES:
             raise DataError(f"{owner}: type is {in_short(name)}, none of {', '.join(OBJECT_TYPES)}")
@@ -191,7 +188,7 @@ def _read_tracks(objects: list[Any], *, has_degrees: bool) -> tuple[Tracks, bool
         height = MEDIAN_SIZE_M.get(types[-1], OTHER_SIZE_M)[2]
         sides = [entry.get("length"), entry.get("width"), entry.get("height") if has_z else height]
         sizes.append(_to_numbers(sides, f"{owner}: length, width, height"))
-        position = _read_points(_get(entry, "position", list, owner), axes, f"{owner}: position")
+        position = _read_points(_get(entry, "position", list, owner), axes, f"{owner}: position", height / 2)
         heading = _to_numbers(_get(entry, "heading", list, owner), f"{owner}: heading")
         velocity = _read_points(_get(entry, "velocity", list, owner), "xy", f"{owner}: velocity")
         is_valid = _get(entry, "valid", list, owner)
@@ -199,9 +196,8 @@ def _read_tracks(objects: list[Any], *, has_degrees: bool) -> tuple[Tracks, bool
         if len(lengths) > 1 or lengths not in ({TOTAL_STEPS}, {HISTORY_STEPS}) or not {*map(type, is_valid)} <= {bool}:
             raise DataError(f"{owner}: not {TOTAL_STEPS} positions, headings, velocities and true or false in valid")
         valid.append(np.array(is_valid))
-        centers = position if has_z else _add_z(position, height / 2)
-        states.append(np.column_stack([centers, heading, velocity]))
-        goal = _read_points([entry.get("goalPosition")], axes, f"{owner}: goalPosition")
+        states.append(np.column_stack([position, heading, velocity[:, :2]]))
+        goal = _read_points([entry.get("goalPosition")], axes, f"{owner}: goalPosition", height / 2)
         last = position[valid[-1]][-1:]
         num_off += int(len(last) > 0 and not np.abs(goal - last).max() <= MAX_OFF_M)
     if len({len(steps) for steps in valid}) > 1:
@@ -238,8 +234,8 @@ def _read_map(roads: list[Any]) -> tuple[MapFeatures, bool]:
         if not isinstance(subtype, int) or subtype not in ROAD_TYPES[name]:
             raise DataError(f"{owner}: map_element_id is {in_short(subtype)}, which is no {name}")
         points = _get(road, "geometry", list, owner)
-        line = _read_points(points, "xyz", owner) if _has_z(points) else _add_z(_read_points(points, "xy", owner))
-        features.append((_to_whole(road.get("id", index), f"{owner}: id"), int(subtype), line))
+        line = _read_points(points, "xyz" if _has_z(points) else "xy", owner)
+        features.append((_to_integer(road.get("id", index), f"{owner}: id"), int(subtype), line))
     return MapFeatures.of(features, has_polygon_rest=True), has_subtypes
 
 
@@ -258,7 +254,7 @@ def _read_lights(lanes: dict[str, Any], num_steps: int) -> LightStates:
         for name, step, *point in zip(names, steps, *stop_points):
             if not isinstance(name, str) or name not in LIGHT_STATES:
                 raise DataError(f"{owner}: state is {in_short(name)}, none of {', '.join(LIGHT_STATES)}")
-            rows.append((_to_whole(step, f"{owner}: time_index", num_steps), int(lane), LIGHT_STATES[name], *point))
+            rows.append((_to_integer(step, f"{owner}: time_index", num_steps), int(lane), LIGHT_STATES[name], *point))
     return LightStates.of(sorted(rows, key=itemgetter(0)))
 
 
@@ -276,11 +272,7 @@ def _has_z(points: list[Any]) -> bool:
     return bool(points) and isinstance(points[0], dict) and "z" in points[0]
 
 
-def _add_z(points: Float64[np.ndarray, "n 2"], z: float = 0.0) -> Float64[np.ndarray, "n 3"]:
-    return np.pad(points, ((0, 0), (0, 1)), constant_values=z)
-
-
-def _to_whole(value: Any, owner: str, stop: int = 2**63) -> int:
+def _to_integer(value: Any, owner: str, stop: int = 2**63) -> int:
     if type(value) is not int or not 0 <= value < stop:
         raise DataError(f"{owner} is {in_short(value)}, no whole number below {stop}")
     return value
@@ -292,9 +284,11 @@ def _to_numbers(values: list[Any], owner: str) -> Float64[np.ndarray, "n"]:
     return np.array(values, np.float64)
 
 
-def _read_points(points: list[Any], axes: str, owner: str) -> Float64[np.ndarray, "n axes"]:
+def _read_points(points: list[Any], axes: str, owner: str, z: float = 0.0) -> Float64[np.ndarray, "n 3"]:
+    """Points of a file; z is that of points without heights."""
     try:
         values = list(chain.from_iterable(map(itemgetter(*axes), points)))
     except (KeyError, TypeError):
         raise DataError(f"{owner}: a point without {', '.join(axes)}") from None
-    return _to_numbers(values, owner).reshape(-1, len(axes))
+    rows = _to_numbers(values, owner).reshape(-1, len(axes))
+    return np.pad(rows, ((0, 0), (0, 3 - len(axes))), constant_values=z)

@@ -1,5 +1,6 @@
 """The contract of a data source: units of files, and the items of each. Sources by name: `scenario.sources`."""
 
+import glob
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -122,6 +123,12 @@ def read_unit(source: DataSource, unit: Unit, *, on_error: OnError) -> Iterator[
         yield record, SkippedRecord(unit.name, record, str(error))
     except OSError as error:
         raise DataError(f"{error.filename or unit.name}: cannot be read: {error.strerror or error}") from error
+
+
+def list_files(path: str | os.PathLike[str]) -> set[Path]:
+    """Paths at a path: a file, a folder with its subfolders, or a glob of either."""
+    paths = [path] if os.path.exists(path) else glob.glob(str(path), recursive=True)
+    return {match for path in map(Path, paths) for match in (path.rglob("*") if path.is_dir() else [path])}
 
 
 def units_of_files(files: Sequence[Path]) -> list[Unit]:

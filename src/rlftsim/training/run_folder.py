@@ -287,7 +287,7 @@ class RunFolder:
 
         Args:
             update: Number of updates done; metrics of later ones are dropped.
-            trackers: Names of trackers.
+            trackers: Names in `TRACKERS`, or "package.module:Class", of trackers to begin.
         """
         if not self._writes:
             return

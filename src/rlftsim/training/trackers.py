@@ -1,7 +1,7 @@
-"""Trackers: programs that show a run while it trains. They are called at the end of an update, never inside one.
+"""Trackers: programs that show a run while the run trains, called at the end of each update.
 
-A tracker that fails, takes too long or is not installed costs the run a warning, and nothing else. Names are those in
-`TRACKERS`, or `package.module:Class`. A package of your own adds a name with an entry point:
+A tracker that fails, takes too long or is not installed costs a warning. Names are those in `TRACKERS`, or
+`package.module:Class`. A package of your own adds a name with an entry point:
 
 [project.entry-points."rlftsim.trackers"]
 mine = "my_package:MyTracker"
@@ -48,12 +48,12 @@ class Tracker(Protocol):
     """Receives the metrics of a run. Made without arguments; all calls come from the same thread."""
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str | None:
-        """Begin a run, or go on with one; returns an id that is handed over as `resume` next time.
+        """Begin a run, or continue a run; returns an id that a later call gets as `resume`.
 
         Args:
             run: Folder of the run.
             config: Settings and inputs of the run by name, names with dots for groups.
-            resume: Id of the run that is continued; None = a new run.
+            resume: Id that an earlier call returned for the run; None = a new run.
         """
         ...
 
@@ -70,7 +70,7 @@ class Tracker(Protocol):
         """Add a result of the run.
 
         Args:
-            path: Folder of files.
+            path: Folder of the files, such as the trained model's.
             kind: Word for the content, "model".
         """
         ...
@@ -84,7 +84,7 @@ class TensorBoardTracker:
     """Events in the folder `tensorboard` of the run."""
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> None:
-        """Nothing but the folder is noted."""
+        """The folder of the events and the settings are noted."""
         self._folder, self._config, self._board = os.path.join(run, "tensorboard"), config, None
 
     def log(self, values: Mapping[str, float], step: int) -> None:
@@ -100,7 +100,7 @@ class TensorBoardTracker:
             self._board.add_scalar(board_tag(name), value, step)
 
     def artifact(self, path: str, kind: str) -> None:
-        """Nothing: TensorBoard shows no files."""
+        """No file is kept: TensorBoard shows none."""
 
     def finish(self, status: Status) -> None:
         """Pending events are written."""
@@ -184,7 +184,7 @@ class TrackioTracker:
         self._run.log(dict(values), step=step)
 
     def artifact(self, path: str, kind: str) -> None:
-        """Nothing: models stay in the folder of the run."""
+        """No file is kept: models stay in the folder of the run."""
 
     def finish(self, status: Status) -> None:
         """Pending rows are written."""
@@ -228,7 +228,7 @@ class RunTrackers:
     """Trackers of a run, begun on construction. A tracker that fails raises no error here.
 
     Args:
-        names: Names of trackers.
+        names: Names in `TRACKERS`, or "package.module:Class".
         folder: Folder of the run, which keeps the ids of the run in the trackers.
         config: Settings and inputs of the run, by name.
     """
@@ -250,7 +250,7 @@ class RunTrackers:
         """Hand over the metrics of an update.
 
         Args:
-            values: Numbers by name.
+            values: Numbers by name, as in metrics.jsonl.
             step: Number of updates done.
         """
         for thread in self._threads.values():

@@ -10,10 +10,10 @@ from rlftsim.evaluation.scenario_source import open_scenarios
 from rlftsim.jobs.files import errors_name
 from rlftsim.jobs.progress import print_line
 from rlftsim.scenario.dataset import dataset_folder
-from rlftsim.verbs.arguments import Data
+from rlftsim.verbs.arguments import Name
 
 
-def export(exporter: str, rollouts: Path, out: Path, *, scenarios: Data) -> None:
+def export(exporter: str, rollouts: Path, out: Path, *, scenarios: Name) -> None:
     """Write stored rollouts as files that other programs read.
 
     Args:
