@@ -37,7 +37,9 @@ TAKEN_FOR_GRANTED = {
     "start.md": ("womd", "argoverse2"),
     "studio.md": ("runs",),
     "submission.md": ("data", "runs"),
-    "training.md": ("data", "runs/v.safetensors", "agent_vocab.npz", "map_tokens.npz"),
+    "training.md": ("data", "runs/v.safetensors"),
+    "training_settings.md": ("data", "runs", "agent_vocab.npz", "map_tokens.npz"),
+    "training_why.md": ("data", "runs"),
     "8_submission.md": ("data", "runs", "submission.toml"),
 }  # fmt: skip
 """Files and folders that a page's reader has."""

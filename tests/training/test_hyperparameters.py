@@ -1,4 +1,4 @@
-"""The table of docs/training.md is what the code does."""
+"""The table of docs/training_settings.md is what the code does."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 from rlftsim.recipes.smart import smart_demo_rlftsim, smart_tiny_rlftsim
 
-PAGE = Path(__file__).parents[2] / "docs" / "training.md"
+PAGE = Path(__file__).parents[2] / "docs" / "training_settings.md"
 PAPER = {
     "learning_rate": 3e-6, "betas": (0.9, 0.999), "warmup_updates": 100, "entropy_bonus": 0.0, "num_rollouts": 4,
     "weight_decay": 0.01, "batch_size": 8, "gradient_clip": 1.0, "kl.horizon": 5.0, "kl.min_beta": 1e-3,

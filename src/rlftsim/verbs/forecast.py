@@ -77,7 +77,7 @@ class TrainingForecast:
     num_measured: int
     processes: int
     micro_batch: int
-    """Scenarios in memory at once, as the settings say, over all processes."""
+    """Scenarios in memory at once with the given settings, over all processes."""
     peak_bytes: int
     """Of all processes, with the largest scenarios."""
     fitting_micro_batch: int
@@ -119,9 +119,8 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
         )
     epochs = float(str(run.settings["epochs"]))
     num_updates = max(math.ceil(epochs * len(dataset) / batch_size), 1)
-    return TrainingForecast(
-        num_updates, run.seconds, num_measured, processes, micro_batch, peak, fitting, available
-    )  # fmt: skip
+    used = min(micro_batch, batch_size)
+    return TrainingForecast(num_updates, run.seconds, num_measured, processes, used, peak, fitting, available)
 
 
 def measure_run(words: list[str], out: Path, num_updates: int) -> MeasuredRun:
@@ -218,5 +217,5 @@ def training_table(command: TrainingCommand, forecast: TrainingForecast) -> Tabl
     table.add_row("an update", f"{forecast.seconds:.3g} s (mean of {forecast.num_measured})")
     table.add_row("in all", f"{total:.0f} s" if total < 120 else f"{total / 60:.0f} min")
     table.add_row("peak memory", f"{needed:.1f} GB of {available:.1f} GB, with the largest scenarios{fits}")
-    table.add_row("micro batch", f"{forecast.micro_batch} as set; up to {forecast.fitting_micro_batch} fit")
+    table.add_row("micro batch", f"{forecast.micro_batch} now, up to {forecast.fitting_micro_batch} fit")
     return table

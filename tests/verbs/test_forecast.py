@@ -1,0 +1,83 @@
+"""`rlftsim doctor --plan finetune|pretrain`: what a training takes, from its own first updates."""
+
+import json
+
+import pytest
+
+from rlftsim.cli.main import main
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.verbs import forecast
+from rlftsim.verbs.forecast import MeasuredRun, TrainingCommand, find_fitting_micro_batch, forecast_training
+from small_things import write_synthetic
+
+GB = 10**9
+
+
+@pytest.mark.parametrize(
+    ("peaks", "available", "fitting"),
+    [
+        ({1: 2 * GB, 5: 6 * GB}, 4 * GB, 3),  # 1 GB each beside 1 GB
+        ({1: 2 * GB, 5: 6 * GB}, 100 * GB, 8),  # never more than an update has
+        ({1: 2 * GB, 5: 6 * GB}, GB, 0),
+        ({4: 2 * GB}, 3 * GB, 8),
+        ({1: 2 * GB, 5: 2 * GB}, 3 * GB, 8),
+    ],
+)
+def test_the_largest_micro_batch_that_fits_lies_on_the_line_through_two_measurements(peaks, available, fitting):
+    assert find_fitting_micro_batch(peaks, available, 8) == fitting
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Runs that take half a second for an update, and 3 GB a process for each scenario of the micro batch."""
+    settings = {"batch_size": 2, "micro_batch_size": 8, "device.processes": 2, "epochs": 3.0}
+    words_of_runs = []
+
+    def measure_run(words, out, num_updates):
+        words_of_runs.append(words)
+        micro_batch = int(words[-1]) if words[-2].endswith("micro-batch-size") else 8
+        return MeasuredRun(0.5, micro_batch * 3 * GB, settings)
+
+    monkeypatch.setattr(forecast, "measure_run", measure_run)
+    return words_of_runs
+
+
+def test_updates_time_and_memory_are_those_of_the_command_itself(measured, monkeypatch, capsys):
+    monkeypatch.setattr(forecast, "find_memory", lambda: 100 * GB)
+    words = ["doctor", "--plan", "finetune", "--recipe", "smart-demo", "--data", "synthetic", "--measure", "2"]
+    assert main([*words, "--model", "runs/base", "--config", "mine.json"]) == 0
+    assert measured[0][:6] == ["finetune", "smart-demo", "--data", "synthetic", "--out", measured[0][5]]
+    assert measured[0][6:] == ["--model", "runs/base", "--config", "mine.json"]
+    out = capsys.readouterr().out
+    # 160 scenarios by 2, three times; 2 processes of 2 x 3 GB
+    for cells in ("240", "0.5 s (mean of 2)", "2 min", "12.0 GB of 100.0 GB", "2 now, up to 2 fit"):
+        assert cells in out
+
+
+def test_a_training_that_cannot_fit_is_refused(measured, monkeypatch):
+    monkeypatch.setattr(forecast, "find_memory", lambda: 5 * GB)
+    with pytest.raises(DataError, match=r"cannot fit: at the least micro batch the largest scenarios need 12.0 GB of"):
+        forecast_training(TrainingCommand("finetune", "smart-demo", "demo-base", "synthetic"), 1)
+
+
+def test_a_forecast_of_a_training_needs_a_recipe(capsys):
+    assert main(["doctor", "--plan", "pretrain", "--data", "synthetic"]) == 2
+    assert (
+        "--plan pretrain needs the recipe of the training: add --recipe, such as smart-demo" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.slow
+def test_a_run_is_stopped_behind_the_updates_that_are_wanted_and_its_mistakes_are_those_of_the_command(tmp_path):
+    write_synthetic(tmp_path / "data")
+    settings = {"finetune": {"epochs": 50.0, "batch_size": 1, "num_rollouts": 2, "warmup_updates": 0}}
+    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    command = TrainingCommand(
+        "finetune", "smart-demo", "demo-base", str(tmp_path / "data"), config=str(tmp_path / "settings.json")
+    )
+    made = forecast_training(command, 2)
+    assert (made.num_updates, made.num_measured, made.processes) == (100, 2, 1)
+    assert 0 < made.seconds < 60
+    assert 100_000_000 < made.peak_bytes < made.available_bytes
+    with pytest.raises(ConfigError, match=r"finetune cannot be forecast: .*nothing.* is neither a model folder"):
+        forecast_training(TrainingCommand("finetune", "smart-demo", "nothing", "synthetic"), 1)
