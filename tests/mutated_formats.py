@@ -296,6 +296,7 @@ def train(folder: Path) -> None:
 def make_run(folder: Path) -> None:
     train(folder)
     shutil.rmtree(folder / "run" / "model")  # as if it had been killed just before its end
+    (folder / "run" / "trackers.json").write_text('{"tensorboard": "abc"}')
 
 
 def read_run(folder: Path) -> None:
@@ -597,10 +598,10 @@ FORMATS: Mapping[str, Format] = {
         ("policies.smart.catk_checkpoint",),
     ),
     "run": Format(
-        {"run/config.json": "json", "run/metrics.jsonl": "jsonl"},
+        {"run/config.json": "json", "run/metrics.jsonl": "jsonl", "run/trackers.json": "json"},
         make_run,
         read_run,
-        ("training.run_folder", "verbs.runs"),
+        ("training.run_folder", "training.trackers", "verbs.runs"),
     ),
     "checkpoint of a run": Format(
         {"run/checkpoints/*4/*.safetensors": "safetensors", "run/checkpoints/*4/*.json": "json"},

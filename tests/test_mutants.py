@@ -43,6 +43,7 @@ NO_FORMAT = {
     "viewer.page": "the page in the box",
     "jobs.processes": "code that the user runs anyway, and bytes of this program's own processes",
     "jobs.runner": "the machine's quota",
+    "verbs.forecast": "the machine's limit of memory",
 }
 """Modules that open files, and why they are none of the table of formats."""
 

@@ -156,8 +156,9 @@ def test_tensorboard_shows_what_belongs_together_under_one_head(name, tag):
 
 def test_tensorboard_shows_settings_to_compare_runs_by_and_plays_a_film(tmp_path):
     folder = RunFolder(tmp_path, tiny.FINETUNE)
-    folder.continue_from(0)
-    folder.close()
+    folder.continue_from(0, ["tensorboard"])
+    folder.log(1, {"loss": 1.0})
+    folder.finish_trackers("finished")
     with SummaryWriter(str(tmp_path / "tensorboard")) as board:
         write_film(board, [np.full((10, 20, 3), grey, np.uint8) for grey in (0, 255)], 7, 0.4)
     events = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()

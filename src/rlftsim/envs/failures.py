@@ -283,9 +283,10 @@ class FailureChain:
         Raises:
             DataError: The planner drives otherwise than before, or the dice are of other blocks.
         """
-        if len(failure.dice) != self.num_blocks:
+        if len(failure.dice) != self.num_blocks or failure.step > self.num_blocks * self.block_steps:
             raise DataError(
-                f"a failure with dice of {len(failure.dice)} blocks, not {self.num_blocks}: estimate again."
+                f"a failure at step {in_short(failure.step)} with dice of {len(failure.dice)} blocks, in an episode of "
+                f"{self.num_blocks} blocks: estimate again."
             )
         [path], episode, state = self.run(np.array([failure.dice]), observe=observe)
         if path.digest != failure.digest:
