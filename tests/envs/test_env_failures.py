@@ -113,7 +113,7 @@ def test_a_failure_runs_again_bit_for_bit(model, planner):
         assert int(np.argmax(gain >= 2.0)) == failure.step
     with pytest.raises(DataError, match="drives otherwise"):
         found.run_again(replace(branched[0], digest="0"))
-    with pytest.raises(DataError, match="a failure at step 999 .*: estimate again"):
+    with pytest.raises(DataError, match=r"a failure at step 999 .*: estimate again"):
         found.run_again(replace(branched[0], step=999))
 
 
