@@ -584,7 +584,9 @@ FORMATS: Mapping[str, Format] = {
         read_policy,
         ("policies.checkpoint",),
     ),
-    "learned planner": Format({"ppo.zip": "npz"}, make_learned_planner, read_learned_planner, ("envs.planners.sb3",)),
+    "learned planner": Format(
+        {"ppo.zip": "npz"}, make_learned_planner, read_learned_planner, ("envs.learned_planner",)
+    ),
     "CAT-K checkpoint": Format(
         {"epoch.ckpt": "checkpoint"},
         make_catk,

@@ -12,7 +12,7 @@ from rlftsim.evaluation.report import ChartGroup, PairedComparison, Report, Resu
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.scenario_pages import EvaluatedModels, ScenarioFiles, write_scenario_files
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.scenario.synthetic import pack_path
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.training.run_folder import describe_environment, flatten, read_metrics, stored_settings
 from rlftsim.viewer.page import Animation
 
@@ -111,7 +111,9 @@ def build_report(
             **{f"run {run.name}": _describe_run(run) for run in runs},
             **(facts or {}),
         },
-        footnotes=[SYNTHETIC_NOTE] if first.provenance.manifest_sha256 == hash_manifest(pack_path()) else [],
+        footnotes=[SYNTHETIC_NOTE]
+        if first.provenance.manifest_sha256 == hash_manifest(dataset_folder("synthetic"))
+        else [],
     )
 
 

@@ -19,7 +19,6 @@ from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.train import find_vocabulary, finetune_model, open_training, pretrain_policy
-from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.policy import frozen_copy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.viewer.picture import to_png
@@ -96,7 +95,7 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     with stage(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
         # Both models from their folders, as `rlftsim evaluate` would load them.
         policies = {BASE: load_policy(str(base)), TUNED: load_policy(str(tuned))}
-        rows = {**policies, FLOOR: ConstantVelocity(), CEILING: "oracle"}
+        rows = {**policies, FLOOR: load_policy("constant_velocity"), CEILING: "oracle"}
         evaluations = tuple(
             evaluate(row, config.data, out / "evaluations", config.evaluate, name=name)  # type: ignore[arg-type]
             for name, row in rows.items()

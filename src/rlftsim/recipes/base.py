@@ -19,7 +19,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
-from rlftsim.tokens.clustering import TokensConfig
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.config import (
     CalibrateConfig,
@@ -70,6 +70,17 @@ class Recipe:
         raise ConfigError(
             f"{type(self).__name__} describes no new policy: take a recipe that does, or fine-tune an existing model."
         )
+
+    def new_policy_for(self, training: Any, vocabulary: Vocabulary | None = None) -> nn.Module:
+        """A policy with fresh weights, with tokens of the training scenarios where a vocabulary is needed and missing.
+
+        Args:
+            training: Training scenarios; the motions are clustered.
+            vocabulary: Vocabulary of the policy; None = built, where the recipe has settings of tokens.
+        """
+        if vocabulary is None and self.tokens is not None:
+            vocabulary = build_vocabulary(training, self.tokens)[0]
+        return self.new_policy(vocabulary)
 
     def like(self, policy: Policy) -> "Recipe":
         """The same recipe for policies of the architecture and sizes of an existing policy.

@@ -25,11 +25,10 @@ from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, OnUpdate, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
+from rlftsim.verbs.runs import print_model, repeat_for_seeds
 from rlftsim.verbs.training import (
     find_held_out,
     load_start,
-    print_model,
-    repeat_for_seeds,
     train,
     with_changes,
     write_card,

@@ -11,18 +11,15 @@ from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.open import to_scenarios
-from rlftsim.scenario.types import Scenarios
-from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.config import PretrainConfig
 from rlftsim.verbs.arguments import Data, File, Model, ModelOrRecipe, OnUpdate, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, find_value
+from rlftsim.verbs.runs import print_model, repeat_for_seeds
 from rlftsim.verbs.training import (
     find_held_out,
     load_start,
-    print_model,
-    repeat_for_seeds,
     train,
     with_changes,
     write_card,
@@ -159,37 +156,29 @@ def pretrain(
     settings: Any = config or (PretrainConfig() if recipe is None else to_recipe(recipe).pretrain)
     settings = with_changes(settings, processes, seed)
     tokens = None if vocabulary is None else Vocabulary.load(Path(vocabulary))
-    if held_out is None:
-        validation: Scenarios | None = find_held_out(scenarios, validation_split, settings.validation.every)
-    else:
-        validation = to_scenarios(held_out)
+    every = settings.validation.every
+    validation = find_held_out(scenarios, validation_split, every) if held_out is None else to_scenarios(held_out)
     if start is None:
         assert recipe is not None
         fresh = to_recipe(recipe)
         # weights are drawn with the recipe's seed
-        learner: Any = _make_policy(fresh if seed is None else replace(fresh, pretrain=settings), tokens, training)
+        learner: Any = (fresh if seed is None else replace(fresh, pretrain=settings)).new_policy_for(training, tokens)
         device = get_device(learner)
     else:
         learner, device = load_start(start)
         if recipe is not None:
-            # a recipe that is handed over has the sizes of the model already, and other values where these are free
-            like = recipe if isinstance(recipe, Recipe) else _to_recipe_like(recipe_by_name(recipe), learner)
             # without a vocabulary all that recipes of other packages may know
-            replaced = () if tokens is None else (tokens, keep_tokens)
-            learner = like.train_further(learner, *replaced)  # pyright: ignore[reportArgumentType]
+            replaced: Any = () if tokens is None else (tokens, keep_tokens)
+            learner = _to_recipe_like(recipe, learner).train_further(learner, *replaced)
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
     limits: Any = {"max_updates": max_updates, "on_update": on_update, "tracker": tracker}
     return train(learner, training, out, settings, device=device, held_out=validation, card=card, **limits)
 
 
-def _make_policy(recipe: Recipe, tokens: Vocabulary | None, training: Scenarios) -> Any:
-    """A policy with fresh weights, and with tokens of the training scenarios where it needs some and there are none."""
-    if tokens is None and recipe.tokens is not None:
-        tokens = build_vocabulary(training, recipe.tokens)[0]
-    return recipe.new_policy(tokens)
-
-
-def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:
-    """The recipe for policies of the sizes of an existing one."""
+def _to_recipe_like(recipe: Recipe | str, policy: Policy) -> Recipe:
+    """Recipe for policies of the sizes of an existing one; a recipe that is handed over has them already."""
+    if isinstance(recipe, Recipe):
+        return recipe
+    named = recipe_by_name(recipe)
     # A recipe of another package may know no models but its own: those are trained further as they are.
-    return recipe if type(recipe).like is Recipe.like else recipe.like(policy)
+    return named if type(named).like is Recipe.like else named.like(policy)

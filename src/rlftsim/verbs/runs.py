@@ -3,17 +3,19 @@
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from rich.table import Table
 
-from rlftsim.errors import DataError, in_short
+from rlftsim.errors import ConfigError, DataError, in_short, whole_number
 from rlftsim.jobs.folder import recognize_folder
-from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.statistics import mean_interval
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, may_change, read_metrics, stored_settings
 
@@ -21,6 +23,8 @@ VALIDATION, BOUND = "validation_rmm", "validation_gain_low"
 MEASURES = (VALIDATION, "rmm", "loss", "imitation_loss")
 """Metrics that say how good a model is, the most telling first; losses are better where they are lower."""
 NO_VALUE = "–"
+Parameters = ParamSpec("Parameters")
+Trained = TypeVar("Trained")
 SEED_FOLDER = "seed-"
 """Beginning of the name of a run's folder, of several that differ in the seed alone."""
 
@@ -190,3 +194,39 @@ def _format(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.5g}"
     return NO_VALUE if value is None else value if isinstance(value, str) else json.dumps(value)
+
+
+def repeat_for_seeds(verb: Callable[Parameters, Trained]) -> Callable[Parameters, Trained]:
+    """Decorator of a verb that trains: `seeds` repeats the verb with a seed and a folder for each run.
+
+    The policy of the first run is returned.
+    """
+
+    @wraps(verb)
+    def train_runs(*arguments: Any, seeds: int | None = None, **options: Any) -> Trained:
+        if seeds is None:
+            return verb(*arguments, **options)
+        call = signature(verb).bind(*arguments, **options).arguments
+        if call.get("out") is None or call.get("seed") is not None:
+            raise ConfigError(f"seeds={seeds}: several runs need a folder for theirs, out, and each has its seed.")
+        policies = []
+        for seed in range(whole_number("seeds", seeds, 1)):
+            changes = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
+            policies.append(verb(**changes))  # pyright: ignore[reportCallIssue] (the same arguments by name)
+        return policies[0]
+
+    return train_runs
+
+
+def print_model(policy: Any, *, out: Path, seeds: int | None) -> None:
+    """Print where the model is, or the table of several runs.
+
+    Args:
+        policy: Trained policy.
+        out: Folder of the run.
+        seeds: Number of runs with different seeds; None = a single one.
+    """
+    if seeds is None:
+        print_line(f"model: {out / 'model'}")
+    else:
+        print_runs(runs([str(folder) for folder in sorted(out.glob(f"{SEED_FOLDER}*"))]))

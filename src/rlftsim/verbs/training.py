@@ -3,19 +3,17 @@
 import copy
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import wraps
-from inspect import signature
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any
 
 from torch import nn
 
 from rlftsim.errors import ConfigError, RlftsimError, whole_number
 from rlftsim.evaluation.learning_curve import film_model, write_calibration_picture, write_learning_curve
-from rlftsim.jobs.progress import log, print_line
+from rlftsim.jobs.progress import log
 from rlftsim.policies.hub import pin_model
 from rlftsim.policies.registry import find_device
 from rlftsim.recipes.card import append_cards, model_card
@@ -27,10 +25,7 @@ from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
 from rlftsim.training.trackers import find_tracker
 from rlftsim.verbs.inputs import remember_name, to_policy
-from rlftsim.verbs.runs import SEED_FOLDER, print_runs
-from rlftsim.verbs.runs import runs as list_runs
 
-Parameters = ParamSpec("Parameters")
 VALIDATION = "validation"
 TUNE = "tune"
 """Split that is validated on where none is named: the part of "validation" that is not of the exam."""
@@ -99,42 +94,6 @@ def train(
     if out is not None:
         remember_name(policy, out)
     return policy
-
-
-def repeat_for_seeds(verb: Callable[Parameters, Policy]) -> Callable[Parameters, Policy]:
-    """Decorator of a verb that trains: `seeds` repeats the verb with a seed and a folder for each run.
-
-    The policy of the first run is returned.
-    """
-
-    @wraps(verb)
-    def train_runs(*arguments: Any, seeds: int | None = None, **options: Any) -> Policy:
-        if seeds is None:
-            return verb(*arguments, **options)
-        call = signature(verb).bind(*arguments, **options).arguments
-        if call.get("out") is None or call.get("seed") is not None:
-            raise ConfigError(f"seeds={seeds}: several runs need a folder for theirs, out, and each has its seed.")
-        policies = []
-        for seed in range(whole_number("seeds", seeds, 1)):
-            changes = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
-            policies.append(verb(**changes))  # pyright: ignore[reportCallIssue] (the same arguments by name)
-        return policies[0]
-
-    return train_runs
-
-
-def print_model(policy: Policy, *, out: Path, seeds: int | None) -> None:
-    """Print where the model is, or the table of several runs.
-
-    Args:
-        policy: Trained policy.
-        out: Folder of the run.
-        seeds: Number of runs with different seeds; None = a single one.
-    """
-    if seeds is None:
-        print_line(f"model: {out / 'model'}")
-    else:
-        print_runs(list_runs([str(folder) for folder in sorted(out.glob(f"{SEED_FOLDER}*"))]))
 
 
 def write_card(description: str, scenarios: Scenarios, start: Any = None) -> str:

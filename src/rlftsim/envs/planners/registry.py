@@ -120,7 +120,7 @@ def _load_sb3(path: str) -> Planner:
         ConfigError: Missing package or file, or a policy that `Sb3Planner` does not take.
     """
     try:
-        from rlftsim.envs.planners.sb3 import Sb3Planner  # a package of its own, which few have
+        from rlftsim.envs.learned_planner import Sb3Planner  # a package of its own, which few have
     except ModuleNotFoundError as error:
         raise ConfigError(f"planner sb3:{path}: {error.name} is missing: pip install stable-baselines3.") from None
     return Sb3Planner(path)
