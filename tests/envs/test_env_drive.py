@@ -550,7 +550,7 @@ def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch, tmp_path
     # a crash in one rollout of three is a failure, and the film shows that rollout
     assert find_failures(row) == row.scenario_ids == choose_films([row], "failures")
     rollouts, filmed = iter(["free", "blocked", "rammed"]), {}
-    monkeypatch.setattr("rlftsim.envs.drive_scenario.build_animation", filmed.update)
+    monkeypatch.setattr("rlftsim.envs.drive_scenario.build_animation", lambda records, _: filmed.update(records))
     monkeypatch.setattr("rlftsim.envs.drive_scenario.to_film", lambda *_, **__: None)
     config = DriveConfig("constant_velocity", traffic=("replay",), num_rollouts=3, film="failures")
     write_film(config, row.scenario_ids[0], tmp_path)
