@@ -7,7 +7,7 @@ import numpy as np
 
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, SCORES
 from rlftsim.evaluation.compare import compare
-from rlftsim.evaluation.learning_curve import run_charts
+from rlftsim.evaluation.learning_curve import run_charts, write_calibration_picture
 from rlftsim.evaluation.report import ChartGroup, PairedComparison, Report, ResultRow, ScenarioRow, ScenarioTable
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.scenario_pages import EvaluatedModels, ScenarioFiles, write_scenario_files
@@ -175,7 +175,13 @@ def _chart_run(run: Path) -> ChartGroup:
             f"Training rollouts come in groups of {settings.get('num_rollouts')}, so their RMM is not comparable with "
             "the table's."
         )
-    return ChartGroup(f"Training: {run.name}", run_charts(lines, settings.get("kl.target")), caption)
+    picture = run / "model" / "calibration.png"
+    return ChartGroup(
+        f"Training: {run.name}",
+        run_charts(lines, settings.get("kl.target")),
+        caption,
+        picture if picture.exists() else write_calibration_picture(run / "model"),
+    )
 
 
 def _describe_run(run: Path) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import os
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -115,6 +116,8 @@ class ChartGroup:
     title: str
     charts: Sequence[Chart]
     caption: str = ""
+    picture: Path | None = None
+    """PNG file below the charts."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,9 @@ def report_html(report: Report) -> str:
     for group in report.chart_groups:
         caption = f'<p class="muted">{escape(group.caption)}</p>' if group.caption else ""
         charts = "".join(chart_html(chart) for chart in group.charts)
-        sections.append(f'<h2>{escape(group.title)}</h2>{caption}<div class="charts">{charts}</div>' if charts else "")
+        picture = _picture_html(group.picture, group.title) if group.picture else ""
+        body = f'<h2>{escape(group.title)}</h2>{caption}<div class="charts">{charts}</div>{picture}'
+        sections.append(body if charts else "")
     # 3. The facts to repeat it.
     if report.facts:
         facts = (f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>" for name, value in report.facts.items())
@@ -308,6 +313,12 @@ def _scenarios_html(table: ScenarioTable) -> str:
         f'<h2>{escape(table.title)}</h2>{note}<div class="card scroll long" tabindex="0"><table class="results">'
         f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
     )
+
+
+def _picture_html(path: Path, title: str) -> str:
+    """The picture inside of the page, so that the page stays a single file."""
+    data = b64encode(path.read_bytes()).decode()
+    return f'<p><img class="card" style="max-width: 100%" src="data:image/png;base64,{data}" alt="{escape(title)}"></p>'
 
 
 def _link(address: str, text: str) -> str:

@@ -29,7 +29,7 @@ BASE, TUNED, FLOOR, CEILING = "base", "fine-tuned", "constant velocity", "oracle
 SUMMARY = (
     "A small next-token traffic model was pre-trained on synthetic scenarios and then fine-tuned closed-loop: it "
     "drives every agent itself, and the realism meta-metric of its own rollouts, left one out at a time (MLOO), is the "
-    "reward."
+    "reward. What is fitted are the weights of a few named features of each decision (calibration), at unchanged speed."
 )
 QUICK_SUMMARY = (
     "Quick run: every stage at its smallest size. These numbers mean nothing; `rlftsim demo` makes real ones."
@@ -90,8 +90,8 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     with stage("pre-training: predict the next token of every agent"):
         policy = recipe.new_policy(vocabulary)
         base = pretrain_policy(policy, training, recipe.pretrain, out / "pretrain")
-    with stage("fine-tuning: closed loop, MLOO reward, KL to the base model"):
-        tuned = finetune_model(base, training, recipe.finetune, out / "finetune")
+    with stage("fine-tuning: closed loop, MLOO reward, calibration at unchanged speed"):
+        tuned = finetune_model(base, training, recipe.calibrate or recipe.finetune, out / "finetune")
     with stage(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
         # Both models from their folders, as `rlftsim evaluate` would load them.
         policies = {BASE: load_policy(str(base)), TUNED: load_policy(str(tuned))}

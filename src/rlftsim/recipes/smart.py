@@ -176,6 +176,7 @@ def smart_demo_quick() -> SmartRecipe:
         tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
         pretrain=replace(recipe.pretrain, epochs=1.0),
         finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4),
+        calibrate=CalibrateConfig(num_scenarios=16, num_rollouts=4),
         catk=recipe.catk and replace(recipe.catk, epochs=0.25, batch_size=4),
         road=recipe.road and replace(recipe.road, epochs=0.25, batch_size=4),
         gcsl=recipe.gcsl and replace(recipe.gcsl, epochs=0.25),

@@ -15,8 +15,8 @@ from rlftsim.scenario.synthetic import pack_path
 def demo(out: Path | None = None, processes: int | Literal["auto"] = "auto", quick: bool = False) -> None:
     """Run the whole pipeline on synthetic scenarios, in minutes, on a CPU.
 
-    Vocabulary, pre-training, closed-loop fine-tuning with the MLOO reward, evaluation on held-out scenarios,
-    and a report with pictures. An interrupted demo continues when the same command is repeated.
+    Vocabulary, pre-training, calibration in closed loop with the MLOO reward, evaluation on held-out scenarios, and a
+    report with pictures. An interrupted demo continues when the same command is repeated.
 
     Args:
         out: Folder for everything; the report is OUT/report.html. Left out: runs/demo or runs/demo-quick.
