@@ -82,6 +82,8 @@ def write_sources(folder, num_scenarios):
         write_records(folder / "womd" / f"training.tfrecord-{number:05d}-of-{NUM_FILES:05d}", messages)
     pack = ScenarioDataset("synthetic", "validation")
     write_dataset(list(pack[:num_scenarios]), folder / "set", split="validation")
+    words = [*commands(folder, folder / "rollouts")["simulate"], "--jobs", "1"]
+    subprocess.run([sys.executable, "-m", "rlftsim", *words], check=True)
     (folder / "entry.toml").write_text(ENTRY)
 
 
@@ -124,6 +126,7 @@ def commands(sources, out):
             "augment", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
             "--num-rollouts", "2", "--top-k", "None", "--scenarios-per-part", "2", "--device", "cpu",
         ],
+        "score --explain": ["score", sources / "rollouts", "--scenarios", sources / "set", "--explain", out],
         "submit build": [
             "submit", "build", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
             "--config", sources / "entry.toml", "--num-shards", "6", "--device", "cpu", "--i-comply",
@@ -238,7 +241,7 @@ def tree(folder):
 
 def is_done(folder):
     """True if the result is there."""
-    if any((folder / name).exists() for name in ("rollouts.json", "config.json")):
+    if any((folder / name).exists() for name in ("rollouts.json", "config.json")) or any(folder.glob("*.html")):
         return not any(folder.glob(".lock*"))
     return any((folder / name).exists() for name in ("manifest.json", "submission.tar.gz", "constant_velocity.parquet"))
 
@@ -311,8 +314,9 @@ def measure(options):
     start_fork_server()
     rounds = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     for backend in options.backends:
-        for name, words in commands(sources, out).items():
-            wanted = -(-options.kills // len(commands(sources, out)))
+        chosen = {name: words for name, words in commands(sources, out).items() if name in (options.commands or [name])}
+        for name, words in chosen.items():
+            wanted = -(-options.kills // len(chosen))
             own = [one for one in rounds if (one["backend"], one["command"]) == (backend, name)]
             had, number = sum(sum(one["kills"].values()) for one in own), len(own)
             if had >= wanted:
@@ -356,6 +360,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kills", type=int, default=100, help="of each back end")
     parser.add_argument("--backends", nargs="+", choices=list(SHARED_WORDS), default=["inline", "processes", "shares"])
+    parser.add_argument("--commands", nargs="+", help="names of the commands; left out, all of them")
     parser.add_argument("--scenarios", type=int, default=24, help="of the data set")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

@@ -114,7 +114,7 @@ class Statistics(nn.Module):
         self.register_buffer("gradients", torch.zeros(num_fitted, num_credits, width, dtype=torch.float64))
         self.register_buffer("fisher", torch.zeros(width, width, dtype=torch.float64))
         self.register_buffer("counts", torch.zeros(3, dtype=torch.float64))
-        shape = 1 + len(config.lengths), num_held_back, len(MEASURED) + len(CONSTRAINTS) + 2
+        shape = 1 + len(config.lengths), num_held_back, len({*MEASURED, *CONSTRAINTS}) + 2
         self.register_buffer("scores", torch.zeros(shape, dtype=torch.float64))
 
 
@@ -128,7 +128,7 @@ class CalibrationLearner(Learner):
         self.fitted_ids, self.held_back_ids = split_scenarios(self.config, len(self.scenarios))
         self.statistics = Statistics(len(self.fitted_ids), len(self.held_back_ids), self.config)
         self.start = self.policy.eta.detach().clone()
-        self.names = (*MEASURED, *CONSTRAINTS, "kl", "num_decisions")
+        self.names = tuple(dict.fromkeys((*MEASURED, *CONSTRAINTS, "kl", "num_decisions")))
         # Batches in order, each a stage and positions in the list of the stage's scenarios. Stage None finds the
         # direction, stage 0 measures without a step, stage i tries length i.
         stages = {
@@ -280,8 +280,8 @@ class CalibrationLearner(Learner):
         rows = torch.zeros(len(positions), len(self.names), dtype=torch.float64, device=fabric.device)
         for batch_positions in batches:
             batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, stage, fabric)
-            values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
-            values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in CONSTRAINTS.items()}
+            values = {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in CONSTRAINTS.items()}
+            values |= {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
             rows[[positions.index(position) for position in batch_positions]] = torch.stack(
                 [values[name].double() for name in self.names], -1
@@ -384,8 +384,9 @@ CONSTRAINTS = {
     "speed": Constraint(share_speed),
     "evaluated_speed": Constraint(partial(share_speed, is_evaluated=True)),
     "min_ade": Constraint(lambda batch, rollouts, agents: agents.displacement_error.double(), is_minimum=True),
+    "kinematic": Constraint(lambda batch, rollouts, agents: agents.sub_scores["kinematic"].double()),
 }
-"""Constrained means by name: m/s of all agents and of the evaluated ones, and minADE in m."""
+"""Constrained means by name: m/s of all agents and of the evaluated ones, minADE in m, and the kinematic sub-score."""
 
 
 # ---- the step --------------------------------------------------------------------------------------------------------

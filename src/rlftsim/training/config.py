@@ -34,7 +34,7 @@ FEATURES = (
     *("overlap_0.5s_walking_cycling", "overlap_1s_walking_cycling", "edge_0.5s_walking_cycling"),
 )
 """Features of this package that calibration weighs, see `policies.calibrated.features`."""
-CONSTRAINED_MEANS = ("speed", "evaluated_speed", "min_ade")
+CONSTRAINED_MEANS = ("speed", "evaluated_speed", "min_ade", "kinematic")
 """Means that calibration may hold, see `calibrate.CONSTRAINTS`."""
 
 
@@ -512,8 +512,8 @@ class CalibrateConfig:
     """A registered reward, or a sum such as "mloo + 0.1*collision_offroad", credited to agents."""
     metric: str = "2025"
     """Configuration of the meta-metric the reward is made of."""
-    constraints: tuple[str, ...] = ("speed", "evaluated_speed")
-    """Means that the step leaves as they are, by prediction: speed, evaluated_speed, min_ade."""
+    constraints: tuple[str, ...] = CONSTRAINED_MEANS
+    """Means that the step leaves as they are, by prediction: speed, evaluated_speed, min_ade, kinematic (realism)."""
     kl: float = 0.01
     """Predicted KL of a step of length 1, nats per decision."""
     lengths: tuple[float, ...] = (0.7, 1.4)
