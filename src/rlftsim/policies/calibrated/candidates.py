@@ -344,26 +344,26 @@ class Candidates:
     # ---- geometry -------------------------------------------------------------------------------------------------
 
     def _find_edge(self, seconds: float) -> tuple[Float[Tensor, "R"], Float[Tensor, "P"]]:
-        """Distance between the agent's side and the nearest road edge if the agent goes on as now, positive inside the
-        road, and the distance that a token subtracts.
+        """Distance between the agent's side and the nearest road edge where the agent gets if it goes on as now,
+        positive inside the road, and the distance that a token's steering subtracts.
 
-        A token's end is near the agent's present way, so the edge there is straight enough; the edge at the agent's
-        side is not, where roads bend: a fast vehicle gets 20 m farther in a second.
+        The edge at the agent's side says little where roads bend: a fast vehicle gets 20 m farther in a second. And the
+        nearest edge of a junction may lie ahead or behind, so braking is no way to or from an edge.
 
         Args:
             seconds: Time from now, seconds.
         """
         steps = seconds / self.seconds
-        turn = self.traffic.turn[self.agent_index] * steps / 2
-        ahead = rotate(self.traffic.speed[self.agent_index][:, None] * seconds * heading_vector(turn), self._heading)
-        points = self.traffic.position[self.agent_index] + ahead
+        turn = self.traffic.turn[self.agent_index] * steps / 2  # of the chord: [R]
+        ahead = rotate(heading_vector(turn), self._heading)
+        points = self.traffic.position[self.agent_index] + ahead * (self.speed * seconds)[:, None]
         to_edge, _, sign = self._find_nearest(self.scene.edges, points, torch.ones_like(self.is_moving))
         distance = to_edge.norm(dim=-1)
         inside = sign * distance - self._size[:, 1] / 2
-        toward = self.of_pairs(rotate(to_edge * (sign / distance.clamp(min=1e-3))[:, None], -self._heading))  # [P, 2]
-        end = rotate(self.end[:, :2] * steps, self.end[:, 2] * (steps - 1) / 2)  # the token's turn goes on, too: [P, 2]
-        offset = end - self.of_pairs(rotate(ahead, -self._heading))
-        return torch.where(distance < EDGE_REACH_M, inside, torch.inf), (offset * toward).sum(-1)
+        # how far the edge lies to the left of the way, over its distance, and how far the token leads to the left
+        edge_left = sign * (ahead[:, 0] * to_edge[:, 1] - ahead[:, 1] * to_edge[:, 0]) / distance.clamp(min=1e-3)
+        left = rotate(self.end[:, :2] * steps, self.end[:, 2] * (steps - 1) / 2 - self.of_pairs(turn))[:, 1]
+        return torch.where(distance < EDGE_REACH_M, inside, torch.inf), left * self.of_pairs(edge_left)
 
     @cached_property
     def _heading(self) -> Float[Tensor, "R"]:
