@@ -83,9 +83,32 @@ def test_the_score_function_is_the_gradient_of_the_log_probability_by_eta(calibr
 
 def test_values_of_features_stay_within_their_bounds(base):
     dist = distribution_of(CalibratedPolicy(base, NAMES), scenes.crowd(num_agents=40))
-    for feature, values in zip(features_by_name(NAMES), dist.values.unbind(-1)):
+    for feature in features_by_name(NAMES):
+        values = feature(dist._candidates)
         assert feature.low <= values.min()
         assert values.max() <= feature.high
+
+
+def test_what_all_candidates_share_changes_nothing(base):
+    # a vehicle that leaves the road with every token it may take: the tokens it would never take are no way out
+    register_feature("off_the_road", low=0.0, high=3.0)(lambda candidates: torch.full_like(candidates.log_ratio, 3.0))
+    try:
+        dist = distribution_of(CalibratedPolicy(base, ["off_the_road"], [-2.6]), SCENES[0])
+        assert torch.equal(dist.logits, dist.base.logits)
+        assert not dist.values.any()
+    finally:
+        FEATURES.remove("off_the_road")
+
+
+def test_a_road_edge_is_that_of_the_way_ahead_and_braking_is_no_way_from_it(base):
+    candidates = distribution_of(CalibratedPolicy(base, NAMES), SCENES[0])._candidates
+    straight = candidates.end[:, 1].abs() < 0.02
+    for seconds in (0.5, 1.0):
+        nearness = candidates.road_edge(seconds)
+        for agent in candidates.row.unique():
+            rows = straight & (candidates.row == agent)
+            # tokens that differ in length alone come equally near
+            torch.testing.assert_close(nearness[rows], nearness[rows][:1].expand(int(rows.sum())), atol=0.1, rtol=0)
 
 
 def test_a_feature_shifts_logits_by_eta_times_its_value_and_only_those_of_candidates(base):
