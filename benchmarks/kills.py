@@ -126,7 +126,10 @@ def commands(sources, out):
             "augment", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
             "--num-rollouts", "2", "--top-k", "None", "--scenarios-per-part", "2", "--device", "cpu",
         ],
-        "score --explain": ["score", sources / "rollouts", "--scenarios", sources / "set", "--explain", out],
+        "score --explain": [
+            "score", sources / "rollouts", "--scenarios", sources / "set", "--name", "constant_velocity", "--out", out,
+            "--explain", out / "pages",
+        ],
         "submit build": [
             "submit", "build", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
             "--config", sources / "entry.toml", "--num-shards", "6", "--device", "cpu", "--i-comply",
@@ -241,7 +244,7 @@ def tree(folder):
 
 def is_done(folder):
     """True if the result is there."""
-    if any((folder / name).exists() for name in ("rollouts.json", "config.json")) or any(folder.glob("*.html")):
+    if any((folder / name).exists() for name in ("rollouts.json", "config.json")):
         return not any(folder.glob(".lock*"))
     return any((folder / name).exists() for name in ("manifest.json", "submission.tar.gz", "constant_velocity.parquet"))
 
