@@ -151,7 +151,7 @@ def _lines(title: str, total: int, done: int, show: bool) -> Advance:
         nonlocal num_done, last
         num_done += count
         moment = time.monotonic()
-        # Work that is done may go on reporting nothing, such as an archive at its last bytes: its last line is said once.
+        # Work that is done may go on reporting nothing, as an archive at its last bytes does: its end is said once.
         is_last = num_done == total and (count > 0 or total == 0)
         if show and (is_last or (num_done < total and moment - last >= SECONDS_BETWEEN_LINES)):
             last = moment
