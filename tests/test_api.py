@@ -781,8 +781,11 @@ ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
     ("call", "message"),
     [
         *((lambda d, n=n: rs.simulate(CV, d, num_rollouts=n), WHOLE) for n in ("4", "12", True, 2.0, None, 0, -1)),
-        *((lambda d, s=s: rs.simulate(CV, d, seed=s), "seed must be a whole number, got") for s in ("a", None, 1.5)),
+        *((lambda d, s=s: rs.simulate(CV, d, seed=s), "seed must be a whole number.*, got") for s in ("a", None, 1.5)),
         *((lambda d, s=s: rs.evaluate(CV, d, seed=s), "seed must be a whole number, got") for s in ("a", None, 1.5)),
+        (lambda d: rs.simulate(CV, d, seed=-1), "seed must be a whole number of at least 0, got -1"),
+        (lambda d: rs.evaluate(CV, d, seed=-1), "seed must not be negative, got -1"),
+        *((lambda d, v=v: v(CV, d, device="cpu"), r"rs\.load_policy\(name, 'cpu'") for v in (rs.simulate, rs.evaluate)),
         (lambda d: rs.simulate(CV, d, sampling=0.5), "sampling must be rs.Sampling"),
         *(
             (lambda d, o=o: rs.simulate(CV, d, **o), f"{next(iter(o))} has no effect on rollouts in memory: leave it")

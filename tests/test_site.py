@@ -104,6 +104,17 @@ def test_from_disk_nothing_is_requested_elsewhere_and_the_search_finds(site, bro
     assert elsewhere == []
 
 
+def test_no_name_in_a_table_of_contents_is_cut(site, browser):
+    if site.name == "mkdocs":
+        pytest.skip("the published site is the other builder's")
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto(f"file://{site}/reference/python.html", wait_until="domcontentloaded")
+    names = "[...document.querySelectorAll('.md-nav--secondary .md-ellipsis')]"
+    assert page.evaluate(f"{names}.length") > 15
+    assert page.evaluate(f"{names}.filter((name) => name.scrollWidth > name.clientWidth + 1).length") == 0
+    page.close()
+
+
 def test_axe_finds_no_serious_violation_on_any_kind_of_page(site, browser, barriers):
     if site.name == "mkdocs":
         pytest.skip("the published site is the other builder's")

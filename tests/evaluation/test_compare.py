@@ -127,17 +127,19 @@ def test_scenarios_without_a_meta_metric_are_counted_beside_the_mean():
 def test_a_comparison_is_shown_with_its_verdict():
     text = render(format_comparison(compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))))
     assert "tuned against base: 2 scenarios in both" in text
-    assert "0.5000  0.6050  +0.1050" in text
-    assert "+0.0415  +0.1685  0.03  better" in text
+    assert "0.5000 0.6050 +0.1050" in text
+    assert "+0.0415 +0.1685 0.03 better" in text
 
 
 def test_a_comparison_needs_80_characters_and_nothing_is_cut(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     comparison = compare(evaluation("demo-base", [0.4, 0.6, 0.5]), evaluation("demo-tuned", [0.5, 0.71, 0.5]))
+    assert len(f"{comparison['meta_metric'].cells[-2]}") == 4  # p has the digits that it mostly has
     print_wide(format_comparison(comparison), format_table(comparison.a, comparison.b))
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
+    assert text.count("demo-tuned") == 3  # no name is broken
     assert text.count("RMM ↑") == 2
     assert all(line.count("0.") >= 4 for line in text.splitlines() if line.strip().startswith("RMM ↑"))
 

@@ -9,7 +9,7 @@ import pytest
 from rich.table import Table
 
 import rlftsim
-from rlftsim.jobs.progress import log, print_line, print_lines, print_wide
+from rlftsim.jobs.progress import log, print_line, print_lines, print_wide, progress_bar
 
 
 def test_no_control_character_of_a_name_reaches_the_terminal(capsys):
@@ -68,3 +68,11 @@ def test_no_cell_of_a_table_is_cut_whatever_the_width(columns, monkeypatch, caps
     assert out.count("±") == 6
     assert sum(out.count(sign) for sign in "0123456789") == 6 * 10 + 6
     assert len(re.findall(r"[a-z]", out)) == len("labelalabelthatmaynotbebroken") + 6 * len("anameofamodel")
+
+
+@pytest.mark.parametrize(("total", "counts"), [(3, (2, 1, 0, 0)), (0, (0,))])
+def test_the_end_of_long_work_is_said_once(total, counts, capsys):
+    with progress_bar("check", total, unit="bytes") as advance:
+        for count in counts:
+            advance(count)
+    assert capsys.readouterr().err.count("check: 100%") == 1

@@ -329,6 +329,20 @@ def contrast(first, second):
     return max(levels) / min(levels)
 
 
+@pytest.mark.parametrize("width", [360, 900, 1280])
+def test_no_text_is_cut_whatever_the_width(browser, studio, width):
+    page = Page(browser, studio, viewport={"width": width, "height": 800}).open()
+    page.wait("document.querySelectorAll('.row span').length > 3")
+    assert page.state("document.documentElement.scrollWidth") <= width
+    boxes = ".row b, .row span, .panel-status, .panel-head, .panel-empty, .top, .inspector section"
+    cut = page.state(f"""[...document.querySelectorAll("{boxes}")].filter((box) => box.scrollWidth > box.clientWidth + 1
+        || box.closest(".row")?.scrollHeight > box.closest(".row")?.clientHeight).map((box) => box.textContent)""")
+    assert cut == []
+    lefts = page.state('[...document.querySelectorAll(".panel")].map((panel) => panel.getBoundingClientRect().left)')
+    assert len(set(lefts)) == (1 if width == 360 else 2)  # narrow pages have their panels below each other
+    page.close()
+
+
 def test_a_model_that_takes_no_goals_says_so_and_the_first_page_plays(browser, tmp_path):
     from rlftsim.studio.session import Session
 

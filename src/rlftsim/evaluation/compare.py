@@ -330,7 +330,7 @@ def comparison_table(name_a: str, name_b: str, alpha: float) -> Table:
     """
     table = Table(
         box=box.SIMPLE,
-        padding=(0, 0, 0, 1),
+        padding=(0, 0),
         collapse_padding=True,
         show_edge=False,
         pad_edge=False,

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError, check_types
+from rlftsim.errors import ConfigError, DataError, check_not_negative, check_types
 from rlftsim.evaluation.columns import SCORES, find_direction
 from rlftsim.evaluation.drift import Drift, measure_drift
 from rlftsim.jobs.documents import describe_type, parse_json
@@ -92,6 +92,7 @@ class EvaluateConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ConfigError(f"evaluate.{name} must be at least 1, got {value}.")
+        check_not_negative(self, ("seed",))
         metric_by_name(self.metric)
         _ = self.sampling
 

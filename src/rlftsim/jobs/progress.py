@@ -151,7 +151,9 @@ def _lines(title: str, total: int, done: int, show: bool) -> Advance:
         nonlocal num_done, last
         num_done += count
         moment = time.monotonic()
-        if show and (moment - last >= SECONDS_BETWEEN_LINES or num_done == total):
+        # Work that is done may go on reporting nothing, as an archive at its last bytes does: its end is said once.
+        is_last = num_done == total and (count > 0 or total == 0)
+        if show and (is_last or (num_done < total and moment - last >= SECONDS_BETWEEN_LINES)):
             last = moment
             # Units of earlier runs took no time in this one, so they do not count for the estimate.
             # Before the first unit of this run there is no estimate; work of no units, such as an empty file, is done.

@@ -88,7 +88,7 @@ def evaluate(
         name = name or evaluation.evaluation_name(pin_model(policy))
         model = load_policy_or_oracle(policy, device)
     else:
-        model = to_policy(policy)
+        model = to_policy(policy, device)
         name = name or find_policy_name(model)
     model = with_guidance(model, guidance_scale)
     # 3. Scores.

@@ -98,10 +98,14 @@ def to_policy(policy: Any, device: Device = "auto") -> Policy:
         device: Device of a policy that is loaded by its name.
 
     Raises:
-        ConfigError: Neither a policy nor the name of one.
+        ConfigError: Neither a policy nor the name of one, or a device for a policy that is loaded already.
     """
     if isinstance(policy, str | os.PathLike):
         return load_policy(policy, device)
+    if device != "auto":
+        raise ConfigError(
+            f"device={device!r} has no effect on a loaded policy: load it with rs.load_policy(name, {device!r})."
+        )
     # A class has the methods of its policies, so it would pass for one.
     if isinstance(policy, type):
         raise ConfigError(

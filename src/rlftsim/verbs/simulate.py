@@ -106,7 +106,7 @@ def simulate(
         DataError: An unknown scenario, or a goal of an agent that is not simulated, out of its reach, or not two finite
             numbers.
     """
-    num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed)
+    num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed, 0)
     limit = None if limit is None else whole_number("limit", limit, 1)
     sampling = to_sampling(sampling)
     if out is None:
