@@ -213,7 +213,9 @@ def find_model(name: str | os.PathLike) -> Path:
     """
     folder = pull_model(name) if is_hub_url(name) else Path(name).expanduser()
     if folder.is_file():
-        raise ConfigError(f"{str(name)!r} is a file: name its folder, {folder.parent}.")
+        is_foreign = folder.suffix == ".ckpt"
+        way_out = "import it, rlftsim model import --from catk" if is_foreign else f"name its folder, {folder.parent}"
+        raise ConfigError(f"{str(name)!r} is a file: {way_out}.")
     if (folder / "model" / CONFIG).exists():
         folder = folder / "model"
     if not folder.is_dir():

@@ -43,6 +43,7 @@ def doctor(
     recipe: str | None = None,
     vocabulary: str | None = None,
     config: str | None = None,
+    method: str | None = None,
     measure: int = 5,
     num_scenarios: int | None = None,
     nodes: int = 1,
@@ -62,6 +63,7 @@ def doctor(
         recipe: Recipe of the training, with --plan finetune or pretrain.
         vocabulary: Vocabulary of the training, with --plan pretrain.
         config: File of settings of the training, with --plan finetune or pretrain.
+        method: Method of fine-tuning, such as calibrate, with --plan finetune; left out, rlft.
         measure: Number of scenarios to measure, of all sizes; with --plan finetune or pretrain of updates.
         num_scenarios: Scenarios of the whole work, with --plan. Left out: 576000 to convert, 44100 to evaluate, 44920
             to submit.
@@ -74,7 +76,7 @@ def doctor(
         if recipe is None:
             raise ConfigError(f"--plan {plan} needs the recipe of the training: add --recipe, such as smart-demo.")
         model = model or ("demo-base" if plan == "finetune" else None)
-        training = TrainingCommand(plan, recipe, model, data, vocabulary, config)
+        training = TrainingCommand(plan, recipe, model, data, vocabulary, config, method)
         print_wide(training_table(training, forecast_training(training, measure)))
         return 0
     if plan is not None:

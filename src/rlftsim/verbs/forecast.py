@@ -9,7 +9,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
@@ -19,13 +19,17 @@ from rlftsim.jobs.progress import log
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.training.parallel import scenario_costs
+from rlftsim.training.registry import method_by_name
 from rlftsim.training.run_folder import flatten, read_metrics, stored_settings
+from rlftsim.verbs.finetune import find_section
 
 WARM_UP = 1
 """Updates that are not counted: they import, and fill caches."""
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """Bytes that a container may use; "max" = no limit."""
 SECONDS_BETWEEN_LOOKS = 0.05
+COUNTED = ("epochs", "batch_size", "num_scenarios", "held_back", "lengths")
+"""Settings that the number of updates follows from, as far as a method has them."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,13 @@ class TrainingCommand:
     vocabulary: str | None = None
     config: str | None = None
     """File of settings."""
+    method: str | None = None
+    """Method of fine-tuning; None = rlft."""
+
+    @property
+    def section(self) -> str:
+        """Section of the recipe with the settings of the training."""
+        return "pretrain" if self.verb == "pretrain" else find_section(self.method or "rlft")
 
     def write_words(self, data: str | Path, out: Path, micro_batch: int | None = None) -> list[str]:
         """Words of the command line.
@@ -51,9 +62,10 @@ class TrainingCommand:
         """
         words = [self.verb, self.recipe, "--data", str(data), "--out", str(out)]
         model_flag = "--model" if self.verb == "finetune" else "--init-from"
-        for flag, value in ((model_flag, self.model), ("--vocabulary", self.vocabulary), ("--config", self.config)):
+        flags = {"--vocabulary": self.vocabulary, "--config": self.config, "--method": self.method}
+        for flag, value in {model_flag: self.model, **flags}.items():
             words += [flag, value] if value is not None else []
-        return words + ([f"--{self.verb}.micro-batch-size", str(micro_batch)] if micro_batch else [])
+        return words + ([f"--{self.section}.micro-batch-size", str(micro_batch)] if micro_batch else [])
 
 
 @dataclass(frozen=True)
@@ -117,8 +129,11 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
             f"{command.verb} {command.recipe} cannot fit: at the least micro batch the largest scenarios need "
             f"{lowest / 1e9:.1f} GB of this machine's {available / 1e9:.1f}: take fewer processes, or a smaller model."
         )
-    epochs = float(str(run.settings["epochs"]))
-    num_updates = max(math.ceil(epochs * len(dataset) / batch_size), 1)
+    counted: Any = {name: value for name, value in run.settings.items() if name in COUNTED}
+    if "lengths" in counted:  # JSON has lists alone
+        counted["lengths"] = tuple(counted["lengths"])
+    method = method_by_name("pretrain" if command.verb == "pretrain" else command.method or "rlft")
+    num_updates = method.settings(**counted).num_updates(len(dataset))
     used = min(micro_batch, batch_size)
     return TrainingForecast(num_updates, run.seconds, num_measured, processes, used, peak, fitting, available)
 
