@@ -1,6 +1,7 @@
 """`rlftsim doctor --plan finetune|pretrain`: what a training takes, from its own first updates."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -51,6 +52,21 @@ def test_updates_time_and_memory_are_those_of_the_command_itself(measured, monke
     out = capsys.readouterr().out
     # 160 scenarios by 2, three times; 2 processes of 2 x 3 GB
     for cells in ("240", "0.5 s (mean of 2)", "2 min", "12.0 GB of 100.0 GB", "2 now, up to 2 fit"):
+        assert cells in out
+
+
+def test_a_calibration_has_the_batches_of_its_stages(measured, monkeypatch, capsys):
+    monkeypatch.setattr(forecast, "find_memory", lambda: 100 * GB)
+    settings = {"batch_size": 4, "micro_batch_size": 2, "device.processes": 1, "lengths": [0.7, 1.4], "held_back": 0.2}
+    original = forecast.measure_run
+    monkeypatch.setattr(forecast, "measure_run", lambda *arguments: replace(original(*arguments), settings=settings))
+    words = ["doctor", "--plan", "finetune", "--method", "calibrate", "--recipe", "smart-demo", "--data", "synthetic"]
+    assert main([*words, "--measure", "2"]) == 0
+    assert measured[0][-2:] == ["--method", "calibrate"]
+    assert measured[1][-2:] == ["--calibrate.micro-batch-size", "2"]
+    out = capsys.readouterr().out
+    # of 160 scenarios 128 by 4, and three times the 32 that are held back
+    for cells in ("56", "28 s", "6.0 GB of 100.0 GB", "2 now, up to 4 fit"):
         assert cells in out
 
 

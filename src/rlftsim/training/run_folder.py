@@ -62,7 +62,7 @@ SCENARIO_FILES = "scenario_files"
 """Input that only data sets have, not lists of scenarios, and not runs of before: compared where both have it."""
 HELD_OUT = "held_out"
 """Input that only runs with validations have."""
-RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, HELD_OUT, "augmented_goals", "teacher")
+RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, HELD_OUT, "augmented_goals")
 """Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
 
 

@@ -116,7 +116,7 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
         batch_size, micro_batch = (int(str(run.settings[name])) for name in ("batch_size", "micro_batch_size"))
         processes = int(str(run.settings["device.processes"]))
         log.info("measure the largest scenarios")
-        largest = write_largest(dataset, batch_size, folder / "largest")
+        largest = write_largest(dataset, max(batch_size, 2), folder / "largest")  # calibration needs 2
         sizes = dict.fromkeys((min(micro_batch, batch_size), processes))
         peaks = {
             size: processes * measure_run(command.write_words(largest, out, size), out, 1).peak_bytes

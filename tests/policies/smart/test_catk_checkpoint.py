@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError
+from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import (
     PREFIX,
     export_catk,
@@ -26,6 +27,8 @@ from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, s
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.policy import Sampling
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.config import FEATURES
+from small_things import write_synthetic
 
 NUM_TOKENS = 5
 HEAD = f"{PREFIX}agent_encoder.token_predict_head.mlp.3.bias"
@@ -144,6 +147,27 @@ def test_the_command_line_takes_and_returns_a_model(policy, tables, tmp_path, ca
     assert main(arguments) == 2
     assert "is not empty" in capsys.readouterr().err
     assert main(["model", "export", names[1], "--to", "catk", str(tmp_path / "back.ckpt")]) == 2
+
+
+def test_a_checkpoint_that_was_imported_is_calibrated_in_one_command(tables, tmp_path, capsys):
+    write_synthetic(tmp_path / "data")
+    config = SmartConfig(
+        dim=16, num_frequencies=4, num_heads=2, head_dim=4, num_map_layers=1, num_decoder_layers=1,
+        agent_map_radius_m=25.0, agent_radius_m=35.0, history_tokens=3, history_drop=0.2,
+    )  # fmt: skip
+    content = {"state_dict": export_catk(fresh(config)), "hyper_parameters": {"model_config": {"decoder": SETTINGS}}}
+    torch.save(content, tmp_path / "theirs.ckpt")
+    out, model, theirs = (str(tmp_path / name) for name in ("calibrated", "model", "theirs.ckpt"))
+    words = ["finetune", "smart-tiny", "--method", "calibrate", "--data", str(tmp_path / "data"), "--out", out]
+    words += ["--processes", "1", "--calibrate.num-rollouts", "2", "--model"]
+    assert main([*words, theirs]) == 2
+    assert "is a file: import it, rlftsim model import --from catk." in capsys.readouterr().err
+    assert main(["model", "import", "--from", "catk", theirs, "--vocabulary", str(tables[0]), "--out", model]) == 0
+    assert main([*words, model]) == 0
+    calibrated, base = load_policy(out), load_policy(model)
+    assert same(calibrated.base, base)
+    assert calibrated.sampling == base.sampling == Sampling(top_k=48)
+    assert [row["feature"] for row in calibrated.calibration["features"]] == list(FEATURES)
 
 
 # ---- what is refused -----------------------------------------------------------------------------
