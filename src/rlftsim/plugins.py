@@ -41,6 +41,7 @@ class ExtensionPoint(Generic[Value]):
             also register theirs.
         use: looks a name up as those who use it do, and raises ConfigError where the thing is none of this kind; None =
             anything is.
+        more: Further forms that a name may have, such as "MODULE:CLASS", for the message on an unknown name.
     """
 
     def __init__(
@@ -50,11 +51,13 @@ class ExtensionPoint(Generic[Value]):
         shipped: Mapping[str, str] | None = None,
         *,
         use: Callable[[str], object] | None = None,
+        more: str = "",
     ):
         self.kind = kind
         self.group = group
         self._shipped = dict(shipped or {})
         self._use = use
+        self._more = f", or {more}" if more else ""
         self._registered: dict[str, Value] = {}
 
     def register(self, name: str) -> Callable[[Registered], Registered]:
@@ -103,7 +106,7 @@ class ExtensionPoint(Generic[Value]):
             near = difflib.get_close_matches(name, names, n=1)
             hint = f"did you mean {near[0]!r}? " if near else ""
             known = f"known are {', '.join(names)}" if names else "there are none"
-            raise ConfigError(f"unknown {self.kind} {in_short(name)}: {hint}{known}.")
+            raise ConfigError(f"unknown {self.kind} {in_short(name)}: {hint}{known}{self._more}.")
         return found
 
     def find(self, name: str) -> Value | None:

@@ -241,6 +241,7 @@ def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys
     errors = capsys.readouterr().err.strip().splitlines()
     assert len(errors) == 7  # no progress bar: nothing was driven
     assert "unknown planner 'walk'" in errors[0]
+    assert errors[0].endswith("or MODULE:CLASS, sb3:FILE.zip.")
     assert "is a file, not a folder" in errors[5]
     assert "names one twice: x, x" in errors[6]
 

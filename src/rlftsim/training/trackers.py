@@ -201,6 +201,7 @@ TRACKERS: ExtensionPoint[Callable[[], Tracker]] = ExtensionPoint(
         "trackio": "rlftsim.training.trackers:TrackioTracker",
     },
     use=lambda name: find_tracker(name),
+    more="MODULE:CLASS",
 )
 """Name -> class."""
 

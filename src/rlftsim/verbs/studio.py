@@ -20,7 +20,7 @@ def studio(
     split: str | None = None,
     out: Path = Path("studio"),
     port: int = 0,
-    no_browser: bool = False,
+    browser: bool = True,
     json: bool = False,
     token_file: Path | None = None,
     host: str = "127.0.0.1",
@@ -41,7 +41,7 @@ def studio(
         split: Split that is shown first. Left out: validation, where there is one.
         out: Folder of everything that the page saves.
         port: Port to listen on; 0 takes a free one.
-        no_browser: Print the address only, and open no browser.
+        browser: Open the page in a browser; without, only the address is printed.
         json: Print the address as JSON.
         token_file: File of the token, for scripts; made where it is missing. With it and --port an open page
             survives a restart.
@@ -64,5 +64,5 @@ def studio(
     session = Session(data, model or ("demo-goals",), split, out, device, rollouts)
     token = None if token_file is None else load_token(token_file)
     server = Studio(session, host=host, port=port, token=token, trusted_hosts=trust_host)
-    announce(server, as_json=json, open_browser=not no_browser)
+    announce(server, as_json=json, open_browser=browser)
     server.run()

@@ -28,6 +28,7 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "pdm": "rlftsim.envs.planners.pdm:PdmPlanner",
     },
     use=lambda name: load_planner(name),
+    more="MODULE:CLASS, sb3:FILE.zip",
 )
 """Name -> class of a planner, or a function from observation to action."""
 
