@@ -332,8 +332,8 @@ def passes_red_light(scenario: Scenario, driven: Float[np.ndarray, "T1 2"]) -> b
     """True for a way that passes the stop point of a red light on its lane.
 
     Args:
-        scenario: Scenario with the map and the lights.
-        driven: Positions from the current step on, map frame, m.
+        scenario: Scenario with the map and the lights; without lights nothing is passed.
+        driven: Positions [T + 1, 2] of the agent from the current step on, map frame, m.
     """
     signals, num_steps = find_signals(scenario), len(driven) - 1
     if signals is None or not num_steps:

@@ -129,9 +129,10 @@ def read_toml(
         path: TOML file of at most `MAX_TOML_BYTES`.
         remedy: Way out at the end of every message.
         error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves the message to the caller.
 
     Raises:
-        FileNotFoundError: No such file; the caller names the file in the message.
+        FileNotFoundError: No such file, and no message for that.
         RlftsimError: The file cannot be read, is no TOML, or nests brackets too deeply.
     """
 
@@ -185,13 +186,13 @@ def damage_named(
     """Turn the errors of a library that reads a file into a line with path, cause and way out; pipes are not read.
 
     Args:
-        path: File that is read inside the block.
+        path: File that is read inside the block; a pipe without an end is refused before the block begins.
         remedy: Way out at the end of the message, such as "write it again".
-        damage: Errors of the library on damaged files.
-        error: Class of the errors raised.
+        damage: Errors by which the library tells of damaged files; all others pass through unchanged.
+        error: Class of the errors raised in place of the library's, such as CheckpointError.
         missing: Whole message where there is no such file; empty leaves the message to the caller.
-        verdict: Words between path and cause.
-        describe: Cause in words.
+        verdict: Words between path and cause, such as " is damaged", with the colon or space in front.
+        describe: Function from an error of the library to the cause in a few words.
 
     Raises:
         FileNotFoundError: No such file, and no message for that.

@@ -116,10 +116,10 @@ class GroupFormat(ResultFormat[range, Stored], Generic[Stored, Result]):
         """Do the scenarios of a group in turn and write the file; an unfinished group leaves no file.
 
         Args:
-            work: Function from the position of a scenario to the result.
-            group: Positions of the scenarios.
-            advance: Function that is called after each scenario.
-            is_stopped: True once another process has failed, or after Ctrl-C.
+            work: Function from the position of a scenario to the result that the file of the group holds.
+            group: Positions of the scenarios that share a file, done one after another in this order.
+            advance: Function that is called with 1 after each scenario, for the progress bar.
+            is_stopped: Function that returns True once another process has failed, or after Ctrl-C.
         """
         results = []
         for position in group:
