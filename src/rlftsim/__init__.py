@@ -20,39 +20,6 @@ from typing import Any
 
 __version__ = "0.2.0.dev0"
 
-__all__ = [
-    "ConstantVelocity",
-    "Evaluation",
-    "FinetuneConfig",
-    "Goals",
-    "Policy",
-    "RealismResult",
-    "RlftsimError",
-    "Rollouts",
-    "Sampling",
-    "Scenario",
-    "SmartPolicy",
-    "check_policy",
-    "check_reward",
-    "compare",
-    "evaluate",
-    "film",
-    "finetune",
-    "leave_one_out",
-    "load_dataset",
-    "load_policy",
-    "masked_mean",
-    "open_studio",
-    "pretrain",
-    "recipe",
-    "register_reward",
-    "report",
-    "score",
-    "show",
-    "simulate",
-    "write_dataset",
-]
-
 _MODULES = {
     "rlftsim.errors": ("RlftsimError",),
     "rlftsim.evaluation.results": ("Evaluation",),
@@ -81,6 +48,7 @@ _MODULES = {
     "rlftsim.viewer.notebook": ("film", "show"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:

@@ -14,17 +14,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
-from rlftsim.envs.actions import ACCELERATION_MPS2, signed_speed
+from rlftsim.envs.actions import ACCELERATION_MPS2, signed_speed, to_heading_frame
 from rlftsim.envs.contact import STOPPED_MPS, Collision
 from rlftsim.envs.episode import Episode, EpisodeState, off_road_m
-from rlftsim.envs.planner_scores import find_signals
-from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M
+from rlftsim.envs.planner_scores import find_signals, passes_red_light
+from rlftsim.envs.road import OUTSIDE_M
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.geometry import wrapped
-from rlftsim.realism.traffic_lights import compute_traffic_light_violation
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 HARD_BRAKING_MPS2 = 6.0
@@ -181,8 +179,7 @@ def _distances(
     x = ego[..., 0, None] + cos * points[:, 0] - sin * points[:, 1]  # [2, t, p]
     y = ego[..., 1, None] + sin * points[:, 0] + cos * points[:, 1]
     dx, dy = x[:, :, None] - other[..., :1], y[:, :, None] - other[..., 1:2]  # [2, t, K, p]
-    cos, sin = np.cos(other[..., 2:]), np.sin(other[..., 2:])
-    along, across = cos * dx + sin * dy, cos * dy - sin * dx
+    along, across = to_heading_frame(dx, dy, other[..., 2:])
     off_x = np.maximum(np.abs(along) - size[:, :1] / 2, 0.0) / np.where(
         along > 0, sigma[0, ..., None], sigma[1, ..., None]
     )
@@ -206,18 +203,11 @@ class RedLight:
     def danger(self, view: StepView) -> float:
         """0 from the violation on; before, minus the seconds until the nearest stop point, less those to brake in."""
         scene, agent = view.index
-        scenario, step = view.episode.world.scenes[scene].scenario, view.step
-        signals = find_signals(scenario)
-        if signals is None:
+        scenario = view.episode.world.scenes[scene].scenario
+        if find_signals(scenario) is None:
             return NEVER
-        driven = np.stack([motion[scene, agent, :2] for motion in view.state.world.track[CURRENT_STEP:]])
-        if step:
-            x, y = torch.from_numpy(driven + scenario.origin).float().T[:, None, None]
-            passed = compute_traffic_light_violation(
-                x, y, torch.ones(1, 1, step, dtype=torch.bool), signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS
-            )
-            if passed.any():
-                return 0.0
+        if passes_red_light(scenario, np.stack([m[scene, agent, :2] for m in view.state.world.track[CURRENT_STEP:]])):
+            return 0.0
         lights = view.episode.world.scenes[scene].lights
         ahead = lights.point - view.ego[:2]
         forward = ahead @ [np.cos(view.ego[2]), np.sin(view.ego[2])]

@@ -88,12 +88,7 @@ class Outcome:
     is_clipped: Bool[np.ndarray, "M"]
 
 
-def build_episode(
-    world: World,
-    controls: Controls,
-    config: EnvConfig,
-    goals: ScenarioGoals | None = None,
-) -> Episode:
+def build_episode(world: World, controls: Controls, config: EnvConfig, goals: ScenarioGoals | None = None) -> Episode:
     """Episode in a world.
 
     Args:
@@ -167,23 +162,14 @@ def advance(
         terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
     following = _with_ends(episode, state)
     ends = following.ended & ~state.ended
-    is_over = state.world.step >= episode.config.max_steps
     terminated = ends & _stopped(episode, state)
     reward = sum((term.weight * terms[term.name] for term in episode.terms), np.zeros(episode.num_agents))
-    return following, Outcome(
-        reward=np.where(state.ended, 0.0, reward),
-        terms=terms,
-        terminated=terminated,
-        truncated=ends & ~terminated & is_over,
-        is_clipped=moves.is_clipped,
-    )
+    reward, truncated = np.where(state.ended, 0.0, reward), ends & ~terminated
+    return following, Outcome(reward, terms, terminated, truncated, moves.is_clipped)
 
 
 def repeat(
-    episode: Episode,
-    state: EpisodeState,
-    motion: Float[np.ndarray, "T M 5"],
-    dice: Sequence[tuple[Dice, ...]],
+    episode: Episode, state: EpisodeState, motion: Float[np.ndarray, "T M 5"], dice: Sequence[tuple[Dice, ...]]
 ) -> EpisodeState:
     """The state after steps of given motion.
 

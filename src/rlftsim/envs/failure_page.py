@@ -20,7 +20,7 @@ from rlftsim.envs.record import Record
 from rlftsim.envs.result import build_animation
 from rlftsim.jobs.files import write_text
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
-from rlftsim.viewer.page import animation_html, page_html
+from rlftsim.viewer.page import animation_html, page_html, read_asset
 
 OTHER_PLANNERS = ("constant_velocity", "idm", "pdm")
 """Planners that drive among the same dice, to tell whether a failure could be avoided."""
@@ -28,14 +28,6 @@ EARLIER_STEPS = 20
 """Full braking begins so many steps before the event."""
 BEFORE_STEPS, AFTER_STEPS = 30, 5
 """Steps of a film before and after the event."""
-_CSS = """
-.failure { margin: 2rem 0; }
-.failure-facts { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: .5rem 1.5rem; }
-.failure-facts dt { color: var(--muted); font-size: .85rem; }
-.failure-facts dd { margin: 0; }
-.table-scroll { overflow-x: auto; }
-.failures-table td, .failures-table th { padding: .2rem .8rem .2rem 0; text-align: left; white-space: nowrap; }
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +206,9 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
     body = f'<h1>{escape(title)}</h1><p class="lead">{escape(intro)}</p>' + "\n".join(map(_exhibit_html, exhibits))
     table = f'<div class="table-scroll"><table class="failures-table"><tr>{cells}</tr>{rows}</table></div>'
     problems = "".join(f"<p>Left out: {escape(problem)}</p>" for problem in study.problems.values())
-    write_text(path, page_html(title, f"{body}<h2>Scenarios</h2>{table}{problems}", extra_css=_CSS))
+    write_text(
+        path, page_html(title, f"{body}<h2>Scenarios</h2>{table}{problems}", extra_css=read_asset("failures.css"))
+    )
 
 
 def _exhibit_html(exhibit: Exhibit) -> str:

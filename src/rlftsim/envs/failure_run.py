@@ -64,13 +64,11 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     if differences:
         raise ConfigError(f"{out} holds failures of another {', '.join(differences)}: name another --out.")
     write_identity(out / ABOUT, identity)
+    agreed = {"study": identity}  # in the file of each item
     # 1. the pilot
-    all_pilots: list[Pilot] = _measure(
-        f"pilot of {config.planner}",
-        ScenarioValues(out / "pilot", ids, _agree(ids, identity), _read_pilot),
-        partial(_drive_pilot, config, ids),
-        runner(len(ids)),
-    )
+    pilot_files = ScenarioValues(out / "pilot", ids, dict.fromkeys(ids, agreed), _read_pilot)
+    drive_pilot = partial(_drive_pilot, config, ids)
+    all_pilots: list[Pilot] = _measure(f"pilot of {config.planner}", pilot_files, drive_pilot, runner(len(ids)))
     pilots = [pilot for pilot in all_pilots if not pilot.problem]
     if not pilots:
         raise DataError(all_pilots[0].problem)
@@ -81,12 +79,9 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         for pilot, (count, is_branching) in zip(pilots, plan) for number in range(1, count + 1)
     ]  # fmt: skip
     names = [item.name for item in items]
-    rounds: list[tuple[Repeat, ...] | str] = _measure(
-        f"failures of {config.planner}",
-        ScenarioValues(out / "repeats", names, _agree(names, identity), _read_round),
-        partial(_drive_round, config, items),
-        _show_estimate(runner(len(items)), out / "repeats"),
-    )
+    files = ScenarioValues(out / "repeats", names, dict.fromkeys(names, agreed), _read_round)
+    drive, telling = partial(_drive_round, config, items), _show_estimate(runner(len(items)), out / "repeats")
+    rounds: list[tuple[Repeat, ...] | str] = _measure(f"failures of {config.planner}", files, drive, telling)
     repeats: dict[str, list[Repeat]] = {pilot.scenario_id: [] for pilot in pilots}
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
     for item, finished in zip(items, rounds):
@@ -104,11 +99,6 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     return study
 
 
-def _agree(names: Sequence[str], identity: Mapping[str, Any]) -> dict[str, Mapping[str, object]]:
-    """Values that the file of each item must agree with."""
-    return {name: {"study": identity} for name in names}
-
-
 def _measure(
     title: str, format: ScenarioValues[Any], work: Callable[[int], Mapping[str, object]], runner: Runner
 ) -> list[Any]:
@@ -124,8 +114,7 @@ def _measure(
 def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict[str, object]:
     episodes = config.chain(ids[position])
     try:
-        if problem := episodes.describe_start_event():
-            return asdict(Pilot(ids[position], (), 0.0, 0, problem))
+        episodes.check_start()
         paths, danger = episodes.start(np.arange(config.pilot))
     except PlannerFailure as error:  # other scenarios may be driven
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
@@ -171,12 +160,9 @@ def _build(cls: type[Value], values: Mapping[str, Any]) -> Value:
     Raises:
         KeyError, TypeError, ValueError: The file was cut or edited.
     """
-    # JSON has lists where the dataclasses have tuples
     arguments = {field.name: values[field.name] for field in fields(cls)}  # type: ignore[arg-type]
-    try:
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items()})
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
+    # JSON has lists where the dataclasses have tuples
+    return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items()})
 
 
 def _show_estimate(runner: Runner, folder: Path) -> Runner:

@@ -264,10 +264,7 @@ def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
         DataError: No such study or row, or a file that was cut or edited.
     """
     path, way_out = folder / FAILURES, "repeat `rlftsim failures`"
-    try:
-        table = read_parquet(path, way_out)
-    except FileNotFoundError:
-        raise DataError(f"{path} is not there: name the --out of `rlftsim failures`.") from None
+    table = read_parquet(path, way_out, missing=f"{path} is not there: name the --out of `rlftsim failures`.")
     if not 0 <= number < len(table):
         raise DataError(f"{path} has {len(table)} failures, counted from 0: there is no number {number}.")
     try:

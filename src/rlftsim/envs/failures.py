@@ -23,7 +23,7 @@ from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, CollisionType
 from rlftsim.envs.dangers import Event, StepView, find_event
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.planners.registry import Planner, guard_planner, read_action_settings, to_planner
+from rlftsim.envs.planners.registry import Planner, PlannerFailure, guard_planner, read_action_settings, to_planner
 from rlftsim.envs.record import build_record
 from rlftsim.envs.resets import describe_start
 from rlftsim.envs.result import Result
@@ -262,16 +262,19 @@ class FailureChain:
             for row in range(repeats)
         )
 
-    def describe_start_event(self) -> str:
-        """Text that says that the event holds at the start; empty where it does not."""
+    def check_start(self) -> None:
+        """Check that the event does not hold at the start.
+
+        Raises:
+            PlannerFailure: The event has happened before the planner acts.
+        """
         episode = self._episode(1)
         state = start(episode, self._dice(np.zeros(1, np.int64)))
-        if self.event.danger(StepView(episode, state, 0)) < 0:
-            return ""
-        return (
-            f"scenario {self.scenario_id}: the event has happened at the start, whatever the planner does: choose "
-            "another scenario or event."
-        )
+        if self.event.danger(StepView(episode, state, 0)) >= 0:
+            raise PlannerFailure(
+                f"scenario {self.scenario_id}: the event has happened at the start, whatever the planner does: choose "
+                "another scenario or event."
+            )
 
     def run_again(self, failure: Failure, observe: Callable[[Episode, EpisodeState], None] | None = None) -> Result:
         """The episode of a failure, bit for bit.
@@ -487,6 +490,5 @@ def estimate_failures(
     measured_event = find_event(event)
     source = make_source(driver, scenario, policy, **settings)
     chain = FailureChain(source, driver, scenario.scenario_id, measured_event, seed=seed)
-    if problem := chain.describe_start_event():
-        raise DataError(problem)
+    chain.check_start()
     return FailureEstimate(chain.estimate(particles, repeats), particles, scenario.scenario_id, chain)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rlftsim.envs.actions import signed_speed
+from rlftsim.envs.actions import signed_speed, to_heading_frame
 from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import compute_headings, sample_line
 from rlftsim.envs.scene import RED, YELLOW, Scene
@@ -114,8 +114,7 @@ def find_meetings(
     """
     # 1. Every point of the line in the frame of every box [M, K, W].
     x, y = line[:, None, :, 0] - boxes[..., 0, None], line[:, None, :, 1] - boxes[..., 1, None]
-    cos, sin = np.cos(boxes[..., 2])[..., None], np.sin(boxes[..., 2])[..., None]
-    forward, lateral = np.abs(x * cos + y * sin), np.abs(y * cos - x * sin)
+    forward, lateral = map(np.abs, to_heading_frame(x, y, boxes[..., 2:3]))
     # 2. It meets the box if the agent's width across the line does.
     turn, half = heading[:, None] - boxes[..., 2:3], width[:, None, None] / 2
     meets = forward <= box_size[..., :1] / 2 + half * np.abs(np.sin(turn))

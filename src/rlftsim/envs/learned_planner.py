@@ -69,14 +69,11 @@ class Sb3Planner:
         if not names:
             raise ValueError(f"activation {activation[:60]}")
         policy_class: Any = ActorCriticPolicy if self._is_flat else MultiInputActorCriticPolicy
-        policy = policy_class(
-            observation_space("flat" if self._is_flat else "dict"),
-            action_space(build_controls(self.action, horizon=self.horizon)),
-            lambda progress: 0.0,
-            net_arch=widths,
-            activation_fn=getattr(torch.nn, names[0]),
-            **({} if self._is_flat else {"features_extractor_class": DriverView}),
-        )
+        observations = observation_space("flat" if self._is_flat else "dict")
+        actions = action_space(build_controls(self.action, horizon=self.horizon))
+        options = {"net_arch": widths, "activation_fn": getattr(torch.nn, names[0])}
+        options |= {} if self._is_flat else {"features_extractor_class": DriverView}
+        policy = policy_class(observations, actions, lambda progress: 0.0, **options)
         policy.load_state_dict(weights)
         return policy.eval()
 

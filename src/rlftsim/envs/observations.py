@@ -6,7 +6,7 @@ Unused rows are zeros, and 0 in the mask. Things above or below the agent's road
 """
 
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int64
@@ -75,27 +75,14 @@ class Observation:
 
     def flat(self) -> Float32[np.ndarray, "M D"]:
         """All numbers of each agent in a row, in the order of the fields."""
-        arrays = [getattr(self, field.name) for field in fields(self)]
+        arrays = self.by_name().values()
         return np.concatenate([array.reshape(len(array), -1).astype(np.float32) for array in arrays], axis=1)
 
 
+_SIZES = {"K": NEIGHBORS, "L": LANES, "E": EDGES, "C": CROSSINGS, "T": LIGHTS, "R": ROUTE}
+_ARRAYS: dict[str, Any] = {field.name: field.type for field in fields(Observation)}
 SHAPES: dict[str, tuple[int, ...]] = {
-    "ego": (12,),
-    "ego_history": (HISTORY + 1, 5),
-    "neighbors": (NEIGHBORS, 10),
-    "neighbors_mask": (NEIGHBORS,),
-    "neighbors_history": (NEIGHBORS, 4 * HISTORY),
-    "lanes": (LANES, 2 * SEGMENT_POINTS + 5),
-    "lanes_mask": (LANES,),
-    "edges": (EDGES, 4),
-    "edges_mask": (EDGES,),
-    "crossings": (CROSSINGS, 8),
-    "crossings_mask": (CROSSINGS,),
-    "lights": (LIGHTS, 6),
-    "lights_mask": (LIGHTS,),
-    "route": (ROUTE, 3),
-    "route_mask": (ROUTE,),
-    "goal": (3,),
+    name: tuple(_SIZES.get(axis) or int(axis) for axis in array.dim_str.split()[1:]) for name, array in _ARRAYS.items()
 }
 """Shape of each array for one agent; masks are int8, all others float32."""
 
@@ -147,10 +134,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     owner = _stack([scene.lanes.lane for scene in scenes], -1)
     states = [np.pad(s.lights.state, ((0, 0), (0, num_lights + 1 - len(s.lights.lane)))) for s in scenes]
     ages = [np.pad(s.lights.age_s, ((0, 0), (0, num_lights + 1 - len(s.lights.lane)))) for s in scenes]
-    light_point = [
-        np.pad(s.lights.point, ((0, num_lights + 1 - len(s.lights.lane)), (0, 0)), constant_values=_FAR_M)
-        for s in scenes
-    ]
+    light_point = padded([s.lights.point for s in scenes], (len(scenes), num_lights + 1, 2), _FAR_M)
     facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
     edges, crossings = _stack([s.edges for s in scenes], _FAR_M), _stack([s.crossings for s in scenes], _FAR_M)
     on_route = [np.isin(owner[b], route.lanes) for (b, _), route in zip(world.actors, routes)]
@@ -164,7 +148,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
             "lanes": (lane_middle, [s.lanes.z[:, SEGMENT_POINTS // 2] for s in scenes]),
             "edges": (edge_middle, [s.edges_z for s in scenes]),
             "crossings": (crossing_middle, [s.crossings_z for s in scenes]),
-            "lights": (np.stack(light_point), [s.lights.z for s in scenes]),
+            "lights": (light_point, [s.lights.z for s in scenes]),
         }
         scene_rows = world.actors[:, 0]
         for name, (middle, z) in features.items():
@@ -181,7 +165,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         edge_middle=edge_middle,
         crossings=crossings,
         crossing_middle=crossing_middle,
-        light_point=np.stack(light_point),
+        light_point=light_point,
         light_state=np.stack(states),
         light_age=np.stack(ages),
         last_logged=np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2),
@@ -224,13 +208,10 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     neighbor_distance = _distance(motion, past[:, -1])
     neighbor_distance[~is_present[:, -1]] = np.inf
     neighbor_distance[row, agent] = np.inf
-    distances = {
-        "lanes": _distance(motion, atlas.lane_middle[scene]),
-        "edges": _distance(motion, atlas.edge_middle[scene]),
-        "crossings": _distance(motion, atlas.crossing_middle[scene]),
-        "lights": _distance(motion, atlas.light_point[scene]),
-        "neighbors": neighbor_distance,
-    }
+    middles = {"lanes": atlas.lane_middle, "edges": atlas.edge_middle, "crossings": atlas.crossing_middle}
+    middles["lights"] = atlas.light_point
+    distances = {name: _distance(motion, points[scene]) for name, points in middles.items()}
+    distances["neighbors"] = neighbor_distance
     nearest_on_route = _distance(motion, atlas.route_points).argmin(1)
     if atlas.heights:
         _leave_out_other_levels(world, atlas, state, nearest_on_route, distances)

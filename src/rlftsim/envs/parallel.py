@@ -149,14 +149,12 @@ class TrafficParallelEnv(ParallelEnv):
         if missing:
             raise ConfigError(f"agent {missing[0]} has no action: every agent in env.agents needs one.")
         array = np.zeros((len(self._names), *controls.limits.shape))
-        for row, name in enumerate(self._names):
-            if name in acting:
-                array[row] = validate_actions([actions[name]], controls, lambda _, row=row: episode.agent_name(row), 1)[
-                    0
-                ]
+        rows = {name: self._names.index(name) for name in acting}
+        for name, row in rows.items():
+            action, agent_name = [actions[name]], lambda _, row=row: episode.agent_name(row)
+            array[row : row + 1] = validate_actions(action, controls, agent_name, 1)
         state, outcome = advance(episode, state, array)
         self._begun = episode, state
-        rows = {name: self._names.index(name) for name in acting}
         terminated = {name: bool(outcome.terminated[row]) for name, row in rows.items()}
         truncated = {name: bool(outcome.truncated[row]) for name, row in rows.items()}
         infos = {name: describe_step(episode, state, outcome, row) for name, row in rows.items()}

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from scipy.signal import savgol_filter
 
 from rlftsim.envs.contact import BEHIND_RAD, in_one_lane, lane_search
-from rlftsim.envs.levels import Levels
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.route import Route
@@ -102,7 +101,7 @@ def score_planner(record: Record) -> PlannerScores:
         collision_rate=float(bool(collisions)),
         at_fault_collision_rate=float(any(faults)),
         hit_rate=float(not all(faults)),
-        red_light_rate=_red_light(record),
+        red_light_rate=float(passes_red_light(record.scene.scenario, record.agent_motion[:, :2])),
         least_ttc_s=least_time_to_collision(record),
         off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(off_road(record).max())),
         route_completion=_gained(record.route, record.agent_motion) / route_length_m if route_length_m else math.nan,
@@ -259,28 +258,17 @@ def least_time_to_collision(record: Record) -> float:
     ego, track = agent_motion[steps], motion[agents, steps]  # [P, 5] each
     gap = track[:, None, :2] - ego[:, None, :2] + time[:, None] * (track[:, None, 3:] - ego[:, None, 3:])  # [P, 31, 2]
     meets = boxes_overlap(gap, ego[:, None, 2], track[:, None, 2], size[record.agent], size[agents, None])
-    if record.scene.levels is not None:
-        meets &= _are_on_level(record, record.scene.levels, agents, steps, time)
+    if record.scene.levels is not None:  # heights at constant speeds and headings
+        z, height = [], record.scene.size[:, 2]
+        for rows in (np.full_like(agents, record.agent), agents):
+            states = record.motion[rows, steps]
+            line = states[:, None, :2] + time[:, None] * states[:, None, 3:]
+            z.append(record.scene.levels.follow_lines(line, record.ground[rows, steps]) + height[rows, None] / 2)
+        meets &= heights_overlap(z[1] - z[0], height[record.agent, None], height[agents, None])
     # tracks that overlap at the start of the episode, such as a stroller and its pusher, are in no danger of it
     overlapping = np.isin(agents, agents[(steps == 0) & meets[:, 0]])
     meets &= ~overlapping[:, None]
     return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else TTC_HORIZON_S
-
-
-def _are_on_level(
-    record: Record,
-    levels: Levels,
-    agents: Int64[np.ndarray, "P"],
-    steps: Int64[np.ndarray, "P"],
-    time: Float[np.ndarray, "t"],
-) -> Bool[np.ndarray, "P t"]:
-    """True where the heights of the planner's agent and of tracks overlap, at constant speeds and headings."""
-    z, height = [], record.scene.size[:, 2]
-    for rows in (np.full_like(agents, record.agent), agents):
-        states = record.motion[rows, steps]
-        line = states[:, None, :2] + time[:, None] * states[:, None, 3:]
-        z.append(levels.follow_lines(line, record.ground[rows, steps]) + height[rows, None] / 2)
-    return heights_overlap(z[1] - z[0], height[record.agent, None], height[agents, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,16 +316,10 @@ def _comfort(record: Record) -> float:
     if not len(motion.jerk):
         return math.nan
     low, high = ACCELERATION
-    holds = (
-        (motion.longitudinal >= low).all()
-        and (motion.longitudinal <= high).all()
-        and (np.abs(motion.lateral) <= LATERAL).all()
-        and (np.abs(motion.yaw_rate) <= YAW_RATE).all()
-        and (np.abs(motion.yaw_acceleration) <= YAW_ACCELERATION).all()
-        and (np.abs(motion.longitudinal_jerk) <= LONGITUDINAL_JERK).all()
-        and (motion.jerk <= JERK).all()
-    )
-    return float(holds)
+    holds = bool((motion.longitudinal >= low).all() and (motion.longitudinal <= high).all())
+    values = motion.lateral, motion.yaw_rate, motion.yaw_acceleration, motion.longitudinal_jerk, motion.jerk
+    bounds = LATERAL, YAW_RATE, YAW_ACCELERATION, LONGITUDINAL_JERK, JERK
+    return float(holds and all((np.abs(value) <= bound).all() for value, bound in zip(values, bounds)))
 
 
 @cached_on_scenario
@@ -346,15 +328,20 @@ def find_signals(scenario: Scenario) -> Signals | None:
     return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
 
 
-def _red_light(record: Record) -> float:
-    signals = find_signals(record.scene.scenario)
-    if signals is None:
-        return 0.0
-    x, y = torch.from_numpy(record.agent_motion[:, :2] + record.scene.scenario.origin).float().T[:, None, None]
-    passed = compute_traffic_light_violation(
-        x, y, torch.ones(1, 1, record.steps, dtype=torch.bool), signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS
-    )
-    return float(passed.any())
+def passes_red_light(scenario: Scenario, driven: Float[np.ndarray, "T1 2"]) -> bool:
+    """True for a way that passes the stop point of a red light on its lane.
+
+    Args:
+        scenario: Scenario with the map and the lights; without lights nothing is passed.
+        driven: Positions [T + 1, 2] of the agent from the current step on, map frame, m.
+    """
+    signals, num_steps = find_signals(scenario), len(driven) - 1
+    if signals is None or not num_steps:
+        return False
+    x, y = torch.from_numpy(driven + scenario.origin).float().T[:, None, None]
+    valid = torch.ones(1, 1, num_steps, dtype=torch.bool)
+    passed = compute_traffic_light_violation(x, y, valid, signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS)
+    return bool(passed.any())
 
 
 def _displacement(record: Record) -> float:

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, Outcome
@@ -70,6 +69,9 @@ def describe_start(episode: Episode, state: EpisodeState, row: int, source: Sour
     """
     scene_row, agent = episode.world.actors[row]
     scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
+    # map frame, from the current step on; NaN where there is no state
+    logged = episode.world.logged[scene_row, agent, CURRENT_STEP:, :3].copy()  # [81, 3]
+    logged[~episode.world.valid[scene_row, agent, CURRENT_STEP:]] = np.nan
     return {
         "scenario": scene.scenario.scenario_id,
         "agent": int(scene.object_id[agent]),
@@ -79,7 +81,7 @@ def describe_start(episode: Episode, state: EpisodeState, row: int, source: Sour
         "route": episode.atlas.routes[row].source,
         "model": source.fingerprint,
         "lights_held": has_frozen_lights(episode, state, row),
-        "logged": logged_poses(episode, row),
+        "logged": logged,
     }
 
 
@@ -101,19 +103,6 @@ def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: 
     if outcome.terminated[row] or outcome.truncated[row]:
         note["result"] = Result(build_record(episode, state, row))
     return note
-
-
-def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
-    """Logged poses of an agent from the current step on, map frame; NaN where there is no state.
-
-    Args:
-        episode: Episode that the agent drives in.
-        row: Index of the agent among the planner-driven agents [M].
-    """
-    scene, agent = episode.world.actors[row]
-    poses = episode.world.logged[scene, agent, CURRENT_STEP:, :3].copy()
-    poses[~episode.world.valid[scene, agent, CURRENT_STEP:]] = np.nan
-    return poses
 
 
 def has_frozen_lights(episode: Episode, state: EpisodeState, row: int) -> bool:

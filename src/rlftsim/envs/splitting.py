@@ -95,14 +95,9 @@ def split(
         is_active &= survival > 0
         rows = np.flatnonzero(is_killed & is_active[:, None])
         if not len(rows):
-            return Splits(
-                probability=survival * (top >= 0).mean(1),
-                weight=survival / particles,
-                num_levels=num_levels,
-                num_runs=num_runs,
-                paths=paths.reshape(repeats, particles, *paths.shape[1:]),
-                danger=top,
-            )
+            probability, weight = survival * (top >= 0).mean(1), survival / particles
+            final_paths = paths.reshape(repeats, particles, *paths.shape[1:])
+            return Splits(probability, weight, num_levels, num_runs, final_paths, top)
         # 2. each killed one becomes a branch of a survivor
         repeat = rows // particles
         survivors = np.argsort(is_killed, axis=1, kind="stable")  # first in each row

@@ -102,10 +102,7 @@ class EgoVectorEnv(VectorEnv):
             ConfigError: an unknown option or scenario.
         """
         observation, notes = self.reset_slots(seed, options)
-        infos: dict[str, Any] = {}
-        for slot, note in enumerate(notes):
-            infos = self._add_info(infos, note, slot)
-        return observation, infos
+        return observation, self._join_infos(notes)
 
     def reset_slots(
         self, seed: int | Sequence[int | None] | None, options: dict[str, Any] | None = None
@@ -151,10 +148,7 @@ class EgoVectorEnv(VectorEnv):
             ConfigError: as `step_slots`.
         """
         observation, rewards, terminated, truncated, notes = self.step_slots(actions)
-        infos: dict[str, Any] = {}
-        for slot, note in enumerate(notes):
-            infos = self._add_info(infos, note, slot)
-        return observation, rewards, terminated, truncated, infos
+        return observation, rewards, terminated, truncated, self._join_infos(notes)
 
     def step_slots(
         self, actions: Any
@@ -207,6 +201,13 @@ class EgoVectorEnv(VectorEnv):
                 final_observation = {name: values[slot] for name, values in last.items()} if is_dict else last[slot]
                 notes[slot] |= {"final_obs": final_observation, "final_info": final[slot]}
         return self._observe(), rewards, terminated, truncated, notes
+
+    def _join_infos(self, notes: list[dict[str, Any]]) -> dict[str, Any]:
+        """Infos of all slots in Gymnasium's form for vectors."""
+        infos: dict[str, Any] = {}
+        for slot, note in enumerate(notes):
+            infos = self._add_info(infos, note, slot)
+        return infos
 
     def _describe_slot(self, slot: int) -> str:
         group = next(group for group in self._groups if slot in group.slots)

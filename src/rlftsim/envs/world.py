@@ -213,7 +213,7 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
         with one_thread(), torch.no_grad():
             block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
         noise = _decision_noise(world, dice)
-    idm_states = tuple(begin_idm(lines, scene) for scene, lines in _idm(world))
+    idm_states = tuple(begin_idm(lines, scene) for scene, lines in zip(world.scenes, world.lines))
     track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
     return WorldState(track, z, block, noise, (tuple(dice),), idm_states)
@@ -253,23 +253,15 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
     if any(len(lines.agents) for lines in world.lines):
         present = world.is_present[:, :, following - 1]
-        moves = [
-            advance_idm(
-                lines,
-                idm_state,
-                previous[b, :count],
-                state.z[-1][b, :count],
-                present[b, :count],
-                scene,
-                following - 1,
-                IDM,
+        moved_states = []
+        for b, (scene, lines) in enumerate(zip(world.scenes, world.lines)):
+            agents = b, slice(len(scene.object_id))
+            there, z = present[agents], state.z[-1][agents]
+            idm_state, motion[b, lines.agents] = advance_idm(
+                lines, idm_states[b], previous[agents], z, there, scene, following - 1, IDM
             )
-            for b, ((scene, lines), idm_state) in enumerate(zip(_idm(world), idm_states))
-            for count in [len(scene.object_id)]
-        ]
-        idm_states = tuple(idm_state for idm_state, _ in moves)
-        for b, (lines, (_, moving)) in enumerate(zip(world.lines, moves)):
-            motion[b, lines.agents] = moving
+            moved_states.append(idm_state)
+        idm_states = tuple(moved_states)
     # 3. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
@@ -377,7 +369,3 @@ def _noise(world: World, dice: Sequence[Dice], purpose: str, per_agent: int) -> 
         )
         for scenario_batch, scene_dice in zip(world.batch.split(1), dice)
     ])  # fmt: skip
-
-
-def _idm(world: World) -> list[tuple[Scene, IdmLines]]:
-    return list(zip(world.scenes, world.lines))

@@ -138,7 +138,8 @@ class RayRunner:
                     try:
                         event, value, total, seconds, machine = pickle.loads(ray.get(ref))
                     except RayError as error:
-                        reason = _reason(error)
+                        first_line = (str(error).strip().splitlines() or [""])[0][:200]
+                        reason = f"{type(error).__name__}: {first_line}"
                         if self.on_death == "stop":
                             name = describe(items[number])
                             raise DataError(
@@ -223,11 +224,6 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
         error = portable_error(error)
         error.add_note(f"on {machine}")
         return pickle.dumps(("error", error, total, time.monotonic() - start, machine))
-
-
-def _reason(error: RayError) -> str:
-    """First line of Ray's message about the end of a process."""
-    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
 
 
 def _cancel(refs: list[Any]) -> None:

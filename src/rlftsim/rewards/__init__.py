@@ -21,21 +21,9 @@ from rlftsim.rewards.expression import Term, parse_reward, write_reward
 from rlftsim.rewards.goal import goal_terms
 
 __all__ = [
-    "REWARDS",
-    "AgentRewards",
-    "Reward",
-    "Rewards",
-    "Term",
-    "compute_rewards",
-    "goal_terms",
-    "leave_one_out",
-    "masked_mean",
-    "parse_reward",
-    "register_agent_rewards",
-    "register_reward",
-    "register_sum",
-    "reward_by_name",
+    "REWARDS", "AgentRewards", "Reward", "Rewards", "Term", "compute_rewards", "goal_terms", "leave_one_out",
+    "masked_mean", "parse_reward", "register_agent_rewards", "register_reward", "register_sum", "reward_by_name",
     "write_reward",
-]
+]  # fmt: skip
 
 del _realism

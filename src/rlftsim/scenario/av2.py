@@ -124,14 +124,12 @@ class Av2Source:
         for file in files:
             split = file.absolute().parent.parent.name
             groups[(split, _parse_id(file)[:2])].append(file)
-        return [
-            Unit(
-                f"{split}/{start}" if split in SPLITS else start,
-                tuple(path for file in group for path in (file, _find_map(file)) if path.exists()),
-                SPLITS.get(split, "unknown"),
-            )
-            for (split, start), group in sorted(groups.items())
-        ]
+        units = []
+        for (split, start), group in sorted(groups.items()):
+            paths = tuple(path for file in group for path in (file, _find_map(file)) if path.exists())
+            name = f"{split}/{start}" if split in SPLITS else start
+            units.append(Unit(name, paths, SPLITS.get(split, "unknown")))
+        return units
 
     def read(self, unit: Unit) -> Iterator[Item]:
         """Scenarios of a unit by id, and the cause for each that cannot be used."""

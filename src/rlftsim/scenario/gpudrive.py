@@ -153,10 +153,9 @@ def read_scenario(file: Path) -> tuple[Scenario, str, int]:
         difficulty = [0] * len(predicted)
     if not tracks.valid[ego, CURRENT_STEP]:
         raise DataError(f"the ego (track {tracks.object_id[ego]}) is not valid at the current step ({CURRENT_STEP})")
+    id_name = "name" if form == "Nocturne" else "scenario_id"
     scenario = Scenario(
-        scenario_id=_get(values, "name" if form == "Nocturne" else "scenario_id", str, "the file").removesuffix(
-            ".json"
-        ),
+        scenario_id=_get(values, id_name, str, "the file").removesuffix(".json"),
         timestamps_s=np.round(np.arange(tracks.valid.shape[1]) * STEP_S, 1),
         tracks=tracks,
         map_features=map_features,

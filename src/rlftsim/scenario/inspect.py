@@ -30,6 +30,8 @@ from rlftsim.scenario.dataset import (
 from rlftsim.scenario.shards import AGENT_COLUMNS, ShardReader, hash_file
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, ObjectType, Scenario
 
+MAX_SPEED_SCENARIOS = 200
+"""Scenarios, spread evenly over the index, that speeds are taken from at most."""
 FAR_MAP_M = 200.0
 """A map whose nearest point is farther from the ego is taken to be in another frame."""
 
@@ -138,15 +140,12 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     return damage + [f for f in content if f.problem.is_damage] + [f for f in content if not f.problem.is_damage]
 
 
-def dataset_stats(
-    folder: str | os.PathLike[str], *, split: str | None = None, max_speed_scenarios: int = 200
-) -> DatasetStats:
+def dataset_stats(folder: str | os.PathLike[str], *, split: str | None = None) -> DatasetStats:
     """Summary of a data set or of a split.
 
     Args:
         folder: Folder of the data set, or "synthetic".
         split: Split to summarize, such as "training"; None = all splits.
-        max_speed_scenarios: Number of scenarios, spread evenly over the index, that speeds are taken from at most.
 
     Raises:
         DataError: No data set in the folder, an unfinished or damaged data set, or no such split.
@@ -155,7 +154,7 @@ def dataset_stats(
     index = dataset.index
     num_scenarios = max(len(dataset), 1)
     agents = {name.removeprefix("num_"): int(sum(index[name].to_pylist())) for name in AGENT_COLUMNS}
-    positions = np.unique(np.linspace(0, len(dataset) - 1, min(max_speed_scenarios, len(dataset))).astype(int))
+    positions = np.unique(np.linspace(0, len(dataset) - 1, min(MAX_SPEED_SCENARIOS, len(dataset))).astype(int))
     # a shard holds scenarios of all splits, so the size is that of the whole data set
     total_bytes = sum((dataset.folder / entry.file).stat().st_size for entry in dataset.manifest.shards)
     total_rows = max(sum(entry.num_rows for entry in dataset.manifest.shards), 1)

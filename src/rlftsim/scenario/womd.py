@@ -8,6 +8,7 @@ import glob
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 
@@ -91,11 +92,7 @@ def read_scenarios(
             if isinstance(item, Scenario):
                 yield item
             elif isinstance(item, SkippedRecord):
-                (report or _log_skipped)(item)
-
-
-def _log_skipped(skipped: SkippedRecord) -> None:
-    log.warning("skipped %s", skipped)
+                (report or partial(log.warning, "skipped %s"))(item)
 
 
 class WomdSource:

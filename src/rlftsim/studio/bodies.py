@@ -1,6 +1,6 @@
 """Bodies of the requests. pydantic checks types and bounds before a body is made."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
@@ -84,10 +84,3 @@ class ExportBody(Body):
     rollout: Annotated[int, Field(ge=0)] = 0
     """First rollout of films and pages."""
     replace: bool = False
-
-
-@dataclass(frozen=True)
-class EmptyBody(Body):
-    """Body of a request with all arguments in the address."""
-
-    nothing: None = field(default=None)

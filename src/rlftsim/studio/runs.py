@@ -7,7 +7,6 @@ or changing a goal computes only new rollouts.
 """
 
 import hashlib
-import json
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field
@@ -311,16 +310,11 @@ class Worker:
         context = self._context(model.name, variant.guidance, variant.split, variant.scenario)
         if run.stop.is_set():
             raise Cancelled
+        goals, sampling = variant.goals_in(batch), Sampling(variant.temperature, variant.top_k)
         return simulate(
-            policy,
-            batch,
-            num_rollouts=ids,
-            seed=variant.seed,
-            context=context,
-            goals=variant.goals_in(batch),
-            sampling=Sampling(variant.temperature, variant.top_k),
+            policy, batch, num_rollouts=ids, seed=variant.seed, context=context, goals=goals, sampling=sampling,
             observe=observe,
-        )
+        )  # fmt: skip
 
     @torch.no_grad()
     def _encode(self, model: str, guidance: float, split: str, scenario_id: str) -> Any:
@@ -341,8 +335,3 @@ class Worker:
         for variant in (v, *with_goals):
             base = run.simulated[free].scored.get(key) if variant != free else None
             run.tell("score", variant=variant, **run.simulated[variant].scored[key].to_payload(base))
-
-
-def as_json(event: tuple[str, dict[str, Any]]) -> str:
-    """Data of an event as a line of JSON."""
-    return json.dumps(event[1], separators=(",", ":"), allow_nan=False)

@@ -64,13 +64,8 @@ class Scored:
         assert explanation is not None
         result, top_result = explanation.result, explanation.ceiling
         (official,), (ceiling,) = result.to_official_fields(), top_result.to_official_fields()
-        features = zip(
-            FEATURE_NAMES,
-            explanation.config.weights,
-            result.likelihoods,
-            top_result.likelihoods,
-            explanation.cost.sum((1, 2)),
-        )
+        weights, costs = explanation.config.weights, explanation.cost.sum((1, 2))
+        features = zip(FEATURE_NAMES, weights, result.likelihoods, top_result.likelihoods, costs)
         return {
             "metric": explanation.config.name,
             "official": _plain(official),

@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import json
 from collections.abc import AsyncIterator
 from functools import cache
 from importlib import resources
@@ -16,11 +17,11 @@ from starlette.types import ASGIApp
 from rlftsim.errors import RlftsimError
 from rlftsim.goals.goals_file import GoalEntry, parse_goals
 from rlftsim.studio import Refusal
-from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, Metric, OpenGoalsBody, RunBody, SaveGoalsBody
+from rlftsim.studio.bodies import CheckBody, ExportBody, Metric, OpenGoalsBody, RunBody, SaveGoalsBody
 from rlftsim.studio.exports import export, save_goals
 from rlftsim.studio.guard import Access, Guard
 from rlftsim.studio.inputs import encode_imported, score_imported
-from rlftsim.studio.runs import Run, Worker, as_json
+from rlftsim.studio.runs import Run, Worker
 from rlftsim.studio.session import Session
 from rlftsim.studio.variants import to_goal_entries
 
@@ -193,7 +194,7 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
         return worker.run(name).score(variant).explained()
 
     @app.post("/api/runs/{name}/cancel")
-    def _cancel(name: str, body: EmptyBody) -> dict[str, Any]:
+    def _cancel(name: str) -> dict[str, Any]:
         """Stop a run at the next decision."""
         worker.cancel(name)
         return {"run": name}
@@ -223,7 +224,8 @@ async def _stream(run: Run, first: int, worker: Worker) -> AsyncIterator[str]:
     while idle_s < IDLE_S and not worker.is_closed:
         events = run.events[sent:]
         for number, event in enumerate(events, sent):
-            yield f"id: {number}\nevent: {event[0]}\ndata: {as_json(event)}\n\n"
+            data = json.dumps(event[1], separators=(",", ":"), allow_nan=False)
+            yield f"id: {number}\nevent: {event[0]}\ndata: {data}\n\n"
             if event[0] in ENDS:
                 return
         sent, idle_s = sent + len(events), 0.0 if events else idle_s + POLL_S

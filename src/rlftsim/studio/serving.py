@@ -76,12 +76,7 @@ class Studio:
         # Another interface is reached under the name that was given for it; in addresses IPv6 stands in brackets.
         self._name = LOOPBACK if host in ALL_INTERFACES else f"[{host}]" if ":" in host else host
         extra_hosts = () if self._name in LOCAL_NAMES else (f"{self._name}:{self.port}",)
-        self.access = Access(
-            self.port,
-            token or new_token(),
-            trusted_hosts=(*trusted_hosts, *extra_hosts),
-            frame_ancestors=frame_ancestors,
-        )
+        self.access = Access(self.port, token or new_token(), (*trusted_hosts, *extra_hosts), frame_ancestors)
         self._worker = Worker(session)
         app = create_app(session, self._worker, self.access)
         # Open streams must not hold up the end.

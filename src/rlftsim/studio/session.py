@@ -110,11 +110,8 @@ class Session:
             Refusal: No such scenario (404).
         """
         if split not in self._datasets or scenario_id not in self._datasets[split]:
-            raise Refusal(
-                f"no scenario {scenario_id} in split {split!r} of {self.data}.",
-                status=404,
-                hint="Choose one of the list.",
-            )
+            sentence = f"no scenario {scenario_id} in split {split!r} of {self.data}."
+            raise Refusal(sentence, status=404, hint="Choose one of the list.")
         return self._datasets[split].by_id(scenario_id)
 
     def model(self, name: str) -> Model:

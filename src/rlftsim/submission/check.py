@@ -198,7 +198,9 @@ class _Pass:
             self._add_foreign(self.data, name, file)
             return
         self.scenario_ids.add(name)
-        if self.data is None or (self.sample < 1 and _hash_fraction(name) >= self.sample):
+        # a number in [0, 1) for each scenario, the same in every check
+        fraction = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little") / 2**64
+        if self.data is None or (self.sample < 1 and fraction >= self.sample):
             return
         try:
             scenario = self.data.by_id(name)
@@ -262,8 +264,3 @@ class _Pass:
     ) -> None:
         """Add a finding about a scenario or shard, or about the archive if `file` is left out."""
         self.check.findings.add(Finding(number, severity, text, file or self.check.archive, scenario_id))
-
-
-def _hash_fraction(scenario_id: str) -> float:
-    """A number in [0, 1) for each scenario, the same in every check."""
-    return int.from_bytes(hashlib.blake2b(scenario_id.encode(), digest_size=8).digest(), "little") / 2**64

@@ -95,23 +95,15 @@ def chart_html(chart: Chart) -> str:
         items = "".join(f"<li>{line.format(css_color(i))}{escape(c.name)}</li>" for i, c in enumerate(chart.curves))
         legend = f'<ul class="legend chart-legend">{items}</ul>'
     # chart.js shows under the pointer: positions in the SVG, and the values as text.
-    hover = embed_json(
-        [
-            {
-                "name": name,
-                "color": css_color(index),
-                "x": [round(float(v), 1) for v in axes.horizontal(x)],
-                "y": [round(float(v), 1) for v in axes.vertical(y)],
-                "at": [f"{v:g}" for v in np.round(x, 2)],
-                "value": [f"{v:.4g}" for v in y],
-            }
-            for index, (name, x, y) in enumerate(curves)
-        ]
-    )
+    hover = []
+    for index, (name, x, y) in enumerate(curves):
+        across, down = ([round(float(v), 1) for v in values] for values in (axes.horizontal(x), axes.vertical(y)))
+        at, value = [f"{v:g}" for v in np.round(x, 2)], [f"{v:.4g}" for v in y]
+        hover.append({"name": name, "color": css_color(index), "x": across, "y": down, "at": at, "value": value})
     return (
         f'<figure class="chart">{title}{legend}'
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(shapes)}</svg>'
-        f'<script type="application/json">{hover}</script>{note}</figure>'
+        f'<script type="application/json">{embed_json(hover)}</script>{note}</figure>'
     )
 
 

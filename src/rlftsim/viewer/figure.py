@@ -222,12 +222,8 @@ def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INC
     # No dates and a fixed salt for ids: the same figure gives the same bytes.
     metadata = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[picture_format]
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "rlftsim"}):
-        write_atomically(
-            path,
-            lambda temporary: figure.savefig(
-                temporary, format=picture_format, dpi=dots_per_inch, facecolor="white", metadata=metadata
-            ),
-        )
+        options = {"format": picture_format, "dpi": dots_per_inch, "facecolor": "white", "metadata": metadata}
+        write_atomically(path, lambda temporary: figure.savefig(temporary, **options))
 
 
 def _axis(width: float, height: float, title: str) -> tuple[Figure, Axes]:

@@ -17,7 +17,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, register_html
 from rlftsim.viewer.film import WRITERS, to_film
-from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
+from rlftsim.viewer.page import Animation, Panel, animation_html, page_html, read_asset
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
 
 MAX_ROLLOUTS = 4
@@ -26,13 +26,6 @@ MAX_SCENARIOS = 3
 """Scenarios of a cell."""
 FRAME_HEIGHT = 660
 """Pixels that one scenario takes."""
-FRAME_CSS = """
-body { background: none } main { padding: 0; max-width: none } figure.player { margin: 0 0 8px }
-.panel canvas { max-height: 420px }
-@media (max-width: 1000px) { .panel canvas { aspect-ratio: 16 / 10 } }
-.controls { position: sticky; bottom: 0; background: var(--surface); padding: 8px 0; margin-top: 4px; z-index: 1 }
-"""
-"""Panels are low enough for the frame, and the controls stay inside, whatever the width of the cell."""
 
 
 class Cell:
@@ -152,7 +145,8 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
             panels.append(Panel(name, motion.with_overlaps(scene.agents)))
         animations.append(Animation(f"Scenario {log.scenario_id}", scene, panels))
     figures = "\n".join(map(animation_html, animations))
-    page = page_html(f"Scenario {scenarios[0].scenario_id}", figures, extra_css=FRAME_CSS)
+    # panels are low enough for the frame, and the controls stay inside, whatever the width of the cell
+    page = page_html(f"Scenario {scenarios[0].scenario_id}", figures, extra_css=read_asset("frame.css"))
     return Cell(page, FRAME_HEIGHT * len(animations), animations)
 
 

@@ -14,9 +14,6 @@ from rlftsim.errors import DataError
 from rlftsim.jobs.files import write_text
 from rlftsim.viewer.scene import SceneMotion, SceneView
 
-SPEEDS = (0.25, 0.5, 1, 2, 4)
-"""Playback speeds, as multiples of real time."""
-
 
 @dataclass(frozen=True, eq=False)
 class Panel:
@@ -53,16 +50,11 @@ class Animation:
 
     def to_payload(self) -> dict[str, Any]:
         """Lists, numbers and text only, in the layout that `player.js` reads."""
-        return {
-            "scene": self.scene.to_payload(),
-            "panels": [
-                {
-                    **panel.trajectories.to_payload(),
-                    "marks": [panel.trajectories.collides is not None, panel.trajectories.offroad is not None],
-                }
-                for panel in self.panels
-            ],
-        }
+        panels = []
+        for motion in (panel.trajectories for panel in self.panels):
+            marks = [motion.collides is not None, motion.offroad is not None]
+            panels.append({**motion.to_payload(), "marks": marks})
+        return {"scene": self.scene.to_payload(), "panels": panels}
 
 
 def animation_html(animation: Animation) -> str:
@@ -81,7 +73,8 @@ def animation_html(animation: Animation) -> str:
         f'<figure class="player" tabindex="0" aria-label="{escape(animation.title)}"{first}>'
         f'<figcaption><div class="player-title">{escape(animation.title)}</div>{caption}</figcaption>'
         f'<div class="panels">{panels}</div>'
-        f"{_controls_html()}{_legend_html(animation)}"
+        # player.js reads `data-part` and hides the class `several` for a single rollout
+        f"{read_asset('controls.html').replace(chr(10), '')}{_legend_html(animation)}"
         '<p class="hint"><kbd>space</kbd> play or pause · <kbd>←</kbd> <kbd>→</kbd> one step · drag to move, wheel to '
         "zoom (after a click into the picture) · point at an agent to follow it in all panels</p>"
         f"{note}"
@@ -98,11 +91,14 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
         extra_css: Style rules after those of the player.
         extra_js: Script after the player's, in the same page.
     """
+    # player and drawing module in one function: a page that stands alone cannot import
+    drawing = read_asset("drawing.js").partition("\nexport {")[0]
+    script = f'(() => {{\n"use strict";\n{drawing}\n{read_asset("player.js")}}})();\n'
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>\n{read_asset('palette.css')}{read_asset('page.css')}{extra_css}</style>"
-        f"</head>\n<body><main>\n{body}\n</main>\n<script>\n{_player_script()}{extra_js}</script></body></html>\n"
+        f"</head>\n<body><main>\n{body}\n</main>\n<script>\n{script}{extra_js}</script></body></html>\n"
     )
 
 
@@ -133,29 +129,6 @@ def embed_json(payload: Any) -> str:
 def read_asset(name: str) -> str:
     """A text file of this package."""
     return (resources.files("rlftsim.viewer") / name).read_text(encoding="utf-8")
-
-
-def _player_script() -> str:
-    """The player and the drawing module before it, in one function: a page that stands alone cannot import."""
-    drawing = read_asset("drawing.js").partition("\nexport {")[0]
-    return f'(() => {{\n"use strict";\n{drawing}\n{read_asset("player.js")}}})();\n'
-
-
-def _controls_html() -> str:
-    """Controls below the panels. `player.js` reads `data-part` and hides the class `several` for a single rollout."""
-    speeds = "".join(f'<option value="{s}"{" selected" if s == 1 else ""}>{s}×</option>' for s in SPEEDS)
-    return (
-        '<div class="controls"><button class="play" data-part="play" aria-label="Play"></button>'
-        '<div class="timeline">'
-        '<input type="range" data-part="time" min="0" max="90" step="any" value="10" aria-label="Time">'
-        '<span class="clock"><b data-part="clock">+0.0 s</b> <span data-part="phase"></span></span></div>'
-        f'<label>speed <select data-part="speed">{speeds}</select></label>'
-        '<label class="several">rollout <select data-part="rollout"></select></label>'
-        '<label class="several"><input type="checkbox" data-part="all" checked> paths of all rollouts</label>'
-        '<span class="zoom"><button data-part="zoom-out" aria-label="Zoom out">−</button>'
-        '<button data-part="zoom-in" aria-label="Zoom in">+</button>'
-        '<button data-part="reset">reset view</button></span></div>'
-    )
 
 
 def _legend_html(animation: Animation) -> str:

@@ -211,15 +211,8 @@ def light_dots(axis: Axes, scene: SceneView, step: int) -> PathCollection:
     colors = [(light.stop_point, LIGHT_COLORS.get(light.states[step : step + 1])) for light in scene.lights]
     observed = [(point, color) for point, color in colors if color]
     points = np.array([point for point, _ in observed]).reshape(-1, 2)
-    return axis.scatter(
-        points[:, 0],
-        points[:, 1],
-        s=26,
-        c=[color for _, color in observed],
-        edgecolors="white",
-        linewidths=0.6,
-        zorder=5,
-    )
+    shown_colors = [color for _, color in observed]
+    return axis.scatter(*points.T, s=26, c=shown_colors, edgecolors="white", linewidths=0.6, zorder=5)
 
 
 def _outline(agents: AgentBoxes, agent: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "3 2"]]:

@@ -5,6 +5,7 @@ Agents are the simulated ones (`Scenario.simulated_indices`), in the order of a 
 mostly zeros.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +18,16 @@ from rlftsim.errors import DataError
 from rlftsim.geometry import boxes_overlap, heights_overlap
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.sources import find_attribution
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, MapFeatureType, Scenario
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    HISTORY_STEPS,
+    LANE_TYPES,
+    POLYGON_TYPES,
+    ROAD_EDGE_TYPES,
+    LightStates,
+    MapFeatureType,
+    Scenario,
+)
 
 
 def compute_overlap(
@@ -76,9 +86,7 @@ MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M = 30.0, 80.0
 UNSEEN_LIGHT = "-"
 
 MAP_STYLES = {
-    MapFeatureType.LANE_UNDEFINED: "lane",
-    MapFeatureType.LANE_FREEWAY: "lane",
-    MapFeatureType.LANE_SURFACE_STREET: "lane",
+    **dict.fromkeys(map(MapFeatureType, LANE_TYPES), "lane"),
     MapFeatureType.LANE_BIKE: "bike_lane",
     MapFeatureType.LINE_UNKNOWN: "white",
     MapFeatureType.LINE_BROKEN_SINGLE_WHITE: "white_broken",
@@ -89,13 +97,8 @@ MAP_STYLES = {
     MapFeatureType.LINE_SOLID_SINGLE_YELLOW: "yellow",
     MapFeatureType.LINE_SOLID_DOUBLE_YELLOW: "yellow",
     MapFeatureType.LINE_PASSING_DOUBLE_YELLOW: "yellow_broken",
-    MapFeatureType.EDGE_UNKNOWN: "edge",
-    MapFeatureType.EDGE_BOUNDARY: "edge",
-    MapFeatureType.EDGE_MEDIAN: "edge",
-    MapFeatureType.STOP_SIGN: "stop_sign",
-    MapFeatureType.CROSSWALK: "crosswalk",
-    MapFeatureType.SPEED_BUMP: "speed_bump",
-    MapFeatureType.DRIVEWAY: "driveway",
+    **dict.fromkeys(map(MapFeatureType, ROAD_EDGE_TYPES), "edge"),
+    **{feature: feature.name.lower() for feature in (MapFeatureType.STOP_SIGN, *POLYGON_TYPES)},
 }
 """Drawing style of each type of map feature."""
 
@@ -279,7 +282,7 @@ def build_scene(scenario: Scenario) -> SceneView:
     return SceneView(
         scenario_id=scenario.scenario_id,
         lines=tuple(lines),
-        lights=_build_lights(scenario.lights, scenario.origin, scenario.num_steps),
+        lights=tuple(_build_lights(scenario.lights, scenario.origin, scenario.num_steps)),
         agents=AgentBoxes(
             object_id=tracks.object_id[indices],
             object_type=tracks.object_type[indices].astype(np.int64),
@@ -375,9 +378,8 @@ def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOL
     return points[keep]
 
 
-def _build_lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Light, ...]:
+def _build_lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> Iterator[Light]:
     """A light per controlled lane; of two entries for a lane and a step the later counts."""
-    built = []
     for lane_id in np.unique(lights.lane_id):
         rows = np.flatnonzero(lights.lane_id == lane_id)
         states = [UNSEEN_LIGHT] * num_steps
@@ -387,8 +389,7 @@ def _build_lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tu
                 states[int(step)] = str(int(state))
         stop_point = lights.stop_point[rows[0], :2].astype(np.float64) - origin
         if np.isfinite(stop_point).all():
-            built.append(Light(stop_point, "".join(states)))
-    return tuple(built)
+            yield Light(stop_point, "".join(states))
 
 
 def _note(scenario: Scenario) -> str:

@@ -18,9 +18,7 @@ class IdmPlanner:
     """
 
     action: ActionType = "bicycle"
-
-    def __init__(self, config: IdmConfig | None = None):
-        self.config = config or IdmConfig()
+    config = IdmConfig()
 
     def reset(self, info: dict[str, Any]) -> None:
         """Do nothing: an IDM planner has no memory."""

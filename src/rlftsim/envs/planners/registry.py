@@ -89,7 +89,11 @@ def load_planner(name: str) -> Planner:
             arguments than these, without such an option, or with an unknown type of action.
     """
     if name.startswith(SB3):
-        return _load_sb3(name.removeprefix(SB3))
+        try:
+            from rlftsim.envs.learned_planner import Sb3Planner  # a package of its own, which few have
+        except ModuleNotFoundError as error:
+            raise ConfigError(f"planner {name}: {error.name} is missing: pip install stable-baselines3.") from None
+        return Sb3Planner(name.removeprefix(SB3))
     location, options = _split_options(name)
     loaded = import_object("planner", location) if ":" in location else PLANNERS.get(location)
     try:
@@ -112,19 +116,6 @@ def load_planner(name: str) -> Planner:
     _check_argument(f"act of planner {name!r}", planner.act, "observation")
     read_action_settings(planner)  # an unknown action ends here, not in the first episode
     return planner
-
-
-def _load_sb3(path: str) -> Planner:
-    """Planner of a file of Stable-Baselines3.
-
-    Raises:
-        ConfigError: Missing package or file, or a policy that `Sb3Planner` does not take.
-    """
-    try:
-        from rlftsim.envs.learned_planner import Sb3Planner  # a package of its own, which few have
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"planner sb3:{path}: {error.name} is missing: pip install stable-baselines3.") from None
-    return Sb3Planner(path)
 
 
 def _split_options(name: str) -> tuple[str, dict[str, Any]]:

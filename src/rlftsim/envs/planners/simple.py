@@ -31,19 +31,15 @@ class Replay:
         has_state = np.isfinite(logged).all(1)
         # where the log has a gap, the agent waits at the last pose
         poses = logged[np.maximum.accumulate(np.where(has_state, np.arange(len(logged)), 0))]
-        self._steps, self._num_steps = _steps_between(poses), 0
+        # each pose in the frame of the pose before
+        offset = np.diff(poses[:, :2], axis=0)
+        x, y = to_heading_frame(offset[:, 0], offset[:, 1], poses[:-1, 2])
+        self._steps, self._num_steps = np.stack([x, y, wrapped(np.diff(poses[:, 2]))], -1).astype(np.float32), 0
 
     def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "3"]:
         """The next logged pose in the frame of the present pose."""
         self._num_steps += 1
         return self._steps[self._num_steps - 1]
-
-
-def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"]:
-    """Each pose but the first in the frame of the pose before, float32."""
-    offset = np.diff(poses[:, :2], axis=0)
-    x, y = to_heading_frame(offset[:, 0], offset[:, 1], poses[:-1, 2])
-    return np.stack([x, y, wrapped(np.diff(poses[:, 2]))], -1).astype(np.float32)
 
 
 class ConstantVelocityPlanner:

@@ -190,11 +190,6 @@ def build_pedestrian(
     return Body(ObjectType.PEDESTRIAN, first_step, smooth, heading, velocity, size)
 
 
-def draw_label_noise(rng: np.random.Generator) -> float:
-    """Noise of an agent along the heading, m: median 10 mm, with a long tail."""
-    return float(rng.gamma(1.6, 0.0078))
-
-
 def add_label_noise(
     rng: np.random.Generator, noise_m: float, position: np.ndarray, heading: np.ndarray, velocity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

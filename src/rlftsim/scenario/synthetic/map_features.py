@@ -1,6 +1,7 @@
 """Map of a whole network in WOMD's terms: lanes and links, road lines, road edges, stop signs, crosswalks."""
 
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -177,16 +178,14 @@ def split_ring(ring: Float[np.ndarray, "n 2"], is_selected: np.ndarray) -> list[
     return [points[a:b] for a, b in find_runs(is_inside) if b - a >= 2]
 
 
-def _edge_features(network: Network, area: Any) -> list[tuple[MapFeatureType, np.ndarray]]:
+def _edge_features(network: Network, area: Any) -> Iterator[tuple[MapFeatureType, np.ndarray]]:
     """Road edges: borders of the drivable area, open at the ends of the network, where the road goes on."""
     ends = np.stack([node.position for node in network.plan.fringe_nodes])
-    rows = []
     for ring, is_median in oriented_rings(area):
         points = resample(ring)
         is_inner = (np.linalg.norm(points[:, None] - ends[None], axis=-1) > OPEN_END_M).all(axis=1)
         edge_type = MapFeatureType.EDGE_MEDIAN if is_median else MapFeatureType.EDGE_BOUNDARY
-        rows += [(edge_type, run) for run in split_ring(points, is_inner)]
-    return rows
+        yield from ((edge_type, run) for run in split_ring(points, is_inner))
 
 
 # --- lanes and lines ----------------------------------------------------------------------------------------------
@@ -221,40 +220,35 @@ def _between_lanes(
     return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, points[: cut + 1]), *rows] if cut > 0 else rows
 
 
-def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
+def _line_features(network: Network) -> Iterator[tuple[MapFeatureType, np.ndarray]]:
     """Road lines of all streets."""
     fringe = {node.node_id for node in network.plan.fringe_nodes}
-    rows = []
     for street in network.plan.streets:
         lanes = [network.lane((street.street_id, k)) for k in range(len(street.lanes))]
         driven = [lane for lane in lanes if lane.lane_type in ("travel", "bicycle")]
         solid_tail = network.plan.network_type != "freeway" and street.to_node not in fringe
         for lane, left in pairwise(driven):
             has_bicycles = "bicycle" in (lane.lane_type, left.lane_type)
-            rows += _between_lanes(_left_border(network, lane), has_bicycles, solid_tail)
+            yield from _between_lanes(_left_border(network, lane), has_bicycles, solid_tail)
         # To the left of a direction: a line along a median, or a shared line between the directions.
         separator = resample(_left_border(network, driven[-1]))
         if street.reverse_id is None:
             if street.street_class != "ramp":
-                rows.append((MapFeatureType.LINE_SOLID_SINGLE_YELLOW, separator))
+                yield MapFeatureType.LINE_SOLID_SINGLE_YELLOW, separator
         elif street.street_id < street.reverse_id:
             is_minor = street.street_class == "residential"
-            line_type = (
-                MapFeatureType.LINE_BROKEN_SINGLE_YELLOW if is_minor else MapFeatureType.LINE_SOLID_DOUBLE_YELLOW
-            )
-            rows.append((line_type, separator))
+            broken, solid = MapFeatureType.LINE_BROKEN_SINGLE_YELLOW, MapFeatureType.LINE_SOLID_DOUBLE_YELLOW
+            yield broken if is_minor else solid, separator
         if street.street_class == "freeway":
-            rows.append((MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(_left_border(network, lanes[0]))))
-    return rows
+            yield MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(_left_border(network, lanes[0]))
 
 
-def _stop_points(network: Network) -> list[tuple[np.ndarray, list[Connector]]]:
+def _stop_points(network: Network) -> Iterator[tuple[np.ndarray, list[Connector]]]:
     """Approaches with a stop sign: position right of the stop line, connectors that the sign controls."""
     approaches: dict[str, list[Connector]] = defaultdict(list)
     for connector in network.connectors:
         if connector.state in ("s", "w"):
             approaches[connector.from_lane[0]].append(connector)
-    rows = []
     for street_id, connectors in approaches.items():
         outermost = network.lane((street_id, min(c.from_lane[1] for c in connectors)))
         street = outermost.street
@@ -262,8 +256,7 @@ def _stop_points(network: Network) -> list[tuple[np.ndarray, list[Connector]]]:
         # lanes between the outermost lane and the sidewalk lie between the lane and the sign
         right = sum(x.width_m for x in street.lanes[: outermost.index] if x.lane_type != "sidewalk")
         border = offset_polyline(outermost.shape, -(outermost.width_m / 2 + right + 0.6))
-        rows.append((border[-1], connectors))
-    return rows
+        yield border[-1], connectors
 
 
 def build_network_map(network: Network) -> NetworkMap:
@@ -314,11 +307,4 @@ def build_network_map(network: Network) -> NetworkMap:
             if neighbor_id in lane_ids:
                 neighbors.append((lane_ids[lane.lane_id], side, lane_ids[neighbor_id]))
     lights = [(c.light, c.link_index, lane_ids[c.lane_id], c.direction) for c in connectors if c.light is not None]
-    return NetworkMap(
-        features=tuple(features),
-        entry_exit=tuple(entry_exit),
-        neighbors=tuple(neighbors),
-        stop_sign_lanes=tuple(signs),
-        light_lanes=tuple(lights),
-        drivable=area,
-    )
+    return NetworkMap(tuple(features), tuple(entry_exit), tuple(neighbors), tuple(signs), tuple(lights), area)

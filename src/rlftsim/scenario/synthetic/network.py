@@ -1,6 +1,7 @@
 """The compiled network, read back: lanes, connectors through junctions, crosswalks, traffic lights."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -105,12 +106,11 @@ def join_shapes(shapes: list[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 
     return points[keep]
 
 
-def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> list[Connector]:
+def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> Iterator[Connector]:
     """Paths of vehicles and bicycles through all junctions."""
     rows = list(root.iter("connection"))
     # rows from ":..." lead out of an internal lane, and so on to the next lane of a path
     onward = {f"{row.get('from')}_{row.get('fromLane')}": row for row in rows if row.get("from", "").startswith(":")}
-    connectors = []
     for row in rows:
         origin = lanes.get(f"{row.get('from')}_{row.get('fromLane')}")
         if origin is None or origin.street is None or not row.get("via"):
@@ -122,23 +122,20 @@ def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> list[
         while onward[lane_ids[-1]].get("via"):
             lane_ids.append(onward[lane_ids[-1]].get("via", ""))
         goal = lanes[f"{row.get('to')}_{row.get('toLane')}"]
-        connectors.append(
-            Connector(
-                from_lane=(origin.street.street_id, origin.index),
-                to_lane=(row.get("to", ""), int(row.get("toLane", 0))),
-                lane_id=lane_ids[0],
-                shape=join_shapes([lanes[lane_id].shape for lane_id in lane_ids]),
-                width_m=min(origin.width_m, goal.width_m),
-                speed_mps=lanes[lane_ids[0]].speed_mps,
-                is_bicycle="bicycle" in (origin.lane_type, goal.lane_type),
-                junction=origin.street.to_node,
-                direction=row.get("dir", "s"),
-                state=row.get("state", "M"),
-                light=row.get("tl"),
-                link_index=int(row.get("linkIndex", 0)),
-            )
+        yield Connector(
+            from_lane=(origin.street.street_id, origin.index),
+            to_lane=(row.get("to", ""), int(row.get("toLane", 0))),
+            lane_id=lane_ids[0],
+            shape=join_shapes([lanes[lane_id].shape for lane_id in lane_ids]),
+            width_m=min(origin.width_m, goal.width_m),
+            speed_mps=lanes[lane_ids[0]].speed_mps,
+            is_bicycle="bicycle" in (origin.lane_type, goal.lane_type),
+            junction=origin.street.to_node,
+            direction=row.get("dir", "s"),
+            state=row.get("state", "M"),
+            light=row.get("tl"),
+            link_index=int(row.get("linkIndex", 0)),
         )
-    return connectors
 
 
 def read_network(path: Path, plan: StreetPlan) -> Network:
@@ -173,11 +170,5 @@ def read_network(path: Path, plan: StreetPlan) -> Network:
     shapes = {junction: _points(outline) for junction, outline in outlines.items() if len(outline.split()) >= 3}
     crossings = [lane for lane in lanes.values() if lane.lane_type == "crossing"]
     crosswalks = tuple((lane.lane_id[1:].rsplit("_", 2)[0], lane.shape, lane.width_m) for lane in crossings)
-    return Network(
-        plan=plan,
-        lanes=lanes,
-        connectors=tuple(_read_connectors(root, lanes)),
-        junction_shapes=shapes,
-        crosswalks=crosswalks,
-        lights=tuple(row.get("id", "") for row in root.iter("tlLogic")),
-    )
+    lights = tuple(row.get("id", "") for row in root.iter("tlLogic"))
+    return Network(plan, lanes, tuple(_read_connectors(root, lanes)), shapes, crosswalks, lights)

@@ -1,5 +1,6 @@
 """Parked cars: along the curb in parking strips, and in rows in the interior of blocks."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,16 +20,8 @@ _CARS, _PROBABILITIES = ("car", "suv", "van"), (0.66, 0.29, 0.05)
 
 def _parked(position: np.ndarray, heading: float, size: tuple[float, float, float], num_steps: int) -> Body:
     """Body that stands still throughout the recording and is never among the tracks to predict."""
-    return Body(
-        ObjectType.VEHICLE,
-        0,
-        np.repeat(position[None], num_steps, axis=0),
-        np.full(num_steps, heading),
-        np.zeros((num_steps, 2)),
-        size,
-        is_parked=True,
-        is_evaluable=False,
-    )
+    motion = np.repeat(position[None], num_steps, axis=0), np.full(num_steps, heading), np.zeros((num_steps, 2))
+    return Body(ObjectType.VEHICLE, 0, *motion, size, is_parked=True, is_evaluable=False)
 
 
 def _draw_car(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -66,7 +59,7 @@ def park_in_strip(
         cars.append(_parked(points[index] + lateral * normal, heading, size, num_steps))
 
 
-def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -> list[Body]:
+def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -> Iterator[Body]:
     """Cars in all parking strips of a network; occupancy is drawn for every street.
 
     Args:
@@ -74,11 +67,9 @@ def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -
         network: Compiled network with lanes of the type "parking".
         num_steps: Length of the recording in steps of 0.1 s.
     """
-    cars = []
     for lane in network.lanes.values():
         if lane.lane_type == "parking":
-            cars += park_in_strip(rng, lane.shape, float(rng.uniform(0.25, 0.9)), num_steps)
-    return cars
+            yield from park_in_strip(rng, lane.shape, float(rng.uniform(0.25, 0.9)), num_steps)
 
 
 def _draw_row(

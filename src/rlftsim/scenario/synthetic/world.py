@@ -56,11 +56,7 @@ def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> Wo
     bodies += read_pedestrians(persons_file, rng)
     bodies += park_in_strips(rng, network, _NUM_STEPS)
     bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[network_type])
-    return World(
-        name="/".join(map(str, seed)),
-        bodies=tuple(bodies),
-        cropper=MapCropper(network_map, draw_ground(rng)),
-        signals={junction: read_signals(path) for junction, path in signal_files.items()},
-        ends=np.stack([node.position for node in plan.fringe_nodes]),
-        num_steps=_NUM_STEPS,
-    )
+    cropper = MapCropper(network_map, draw_ground(rng))
+    signals = {junction: read_signals(path) for junction, path in signal_files.items()}
+    ends = np.stack([node.position for node in plan.fringe_nodes])
+    return World("/".join(map(str, seed)), tuple(bodies), cropper, signals, ends, _NUM_STEPS)
