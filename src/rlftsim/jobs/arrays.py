@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.errors import DataError, RlftsimError
-from rlftsim.jobs.documents import damage_named, first_line
+from rlftsim.jobs.documents import check_has_end, first_line
 
 MAX_ARRAY_BYTES = 1 << 30
 """Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
@@ -30,7 +30,7 @@ _ARRAY_DAMAGE = (
 
 
 def read_tensors(
-    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
+    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError
 ) -> tuple[dict[str, Tensor], Mapping[str, str]]:
     """Tensors of a safetensors file by name, on the CPU, and the texts in the header.
 
@@ -38,18 +38,19 @@ def read_tensors(
         path: Safetensors file; the header is checked against the size of the file before any tensor is made.
         remedy: Way out at the end of every message, such as "write it again".
         error: Class of the errors raised.
-        missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
-        FileNotFoundError: No such file, and no message for that.
+        FileNotFoundError: No such file; the caller names the file in the message.
         RlftsimError: Damaged file.
     """
-    verdict = ": damaged safetensors file"
-    with (
-        damage_named(path, remedy, _TENSOR_DAMAGE, error=error, missing=missing, verdict=verdict),
-        safe_open(path, framework="pt") as file,
-    ):
-        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    try:
+        check_has_end(path)
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except FileNotFoundError:
+        raise
+    except _TENSOR_DAMAGE as problem:
+        raise error(f"{path}: damaged safetensors file ({first_line(problem)}): {remedy}.") from None
 
 
 def read_npz(
@@ -68,25 +69,25 @@ def read_npz(
         RlftsimError: No npz, damaged, an array of Python objects, or an array that unfolds to more than
             `MAX_ARRAY_BYTES`.
     """
-    with (
-        damage_named(path, remedy, _ARRAY_DAMAGE, error=error, describe=_describe_cause),
-        warnings.catch_warnings(action="ignore"),  # numpy and Python warn of odd headers
-        zipfile.ZipFile(path) as archive,
-    ):
-        members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
-        sizes = {name: _read_header(archive, member) for name, member in members.items()}
-        if sum(sizes.values()) > MAX_ARRAY_BYTES:
-            raise ValueError(f"its arrays unfold to {sum(sizes.values()) / 1e9:.3g} GB")
-        arrays = {}
-        for name, member in members.items():
-            with archive.open(member) as file:
-                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)  # pyright: ignore
-        return arrays
-
-
-def _describe_cause(problem: BaseException) -> str:
-    is_cut = isinstance(problem, zipfile.BadZipFile | EOFError)
-    return "it is not an npz archive, or cut off" if is_cut else first_line(problem)
+    try:
+        check_has_end(path)
+        # numpy and Python warn of odd headers
+        with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(path) as archive:
+            members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
+            sizes = {name: _read_header(archive, member) for name, member in members.items()}
+            if sum(sizes.values()) > MAX_ARRAY_BYTES:
+                raise ValueError(f"its arrays unfold to {sum(sizes.values()) / 1e9:.3g} GB")
+            arrays = {}
+            for name, member in members.items():
+                with archive.open(member) as file:
+                    arrays[name] = np.lib.format.read_array(file, allow_pickle=False)  # pyright: ignore
+            return arrays
+    except FileNotFoundError:
+        raise
+    except _ARRAY_DAMAGE as problem:
+        is_cut = isinstance(problem, zipfile.BadZipFile | EOFError)
+        cause = "it is not an npz archive, or cut off" if is_cut else first_line(problem)
+        raise error(f"{path}: cannot be read ({cause}): {remedy}.") from None
 
 
 def _read_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:

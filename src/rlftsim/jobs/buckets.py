@@ -54,6 +54,17 @@ def folder_address(url: str) -> str:
     return url.rstrip("/")
 
 
+def check_writable(url: str) -> None:
+    """Check that data may be written to an address.
+
+    Raises:
+        ConfigError: The protocol is in `READ_ONLY`.
+    """
+    protocol = url.partition("://")[0]
+    if protocol in READ_ONLY:
+        raise ConfigError(f"{url}: {protocol}:// is read only here: upload the folder with that site's own tools.")
+
+
 def validate_folder(folder: str | os.PathLike[str]) -> Path:
     """The path of a folder of this machine.
 
@@ -68,6 +79,16 @@ def validate_folder(folder: str | os.PathLike[str]) -> Path:
 def cache_folder() -> Path:
     """Folder for fetched files: RLFTSIM_CACHE, else ~/.cache/rlftsim."""
     return Path(os.environ.get("RLFTSIM_CACHE", "~/.cache/rlftsim")).expanduser()
+
+
+def local_copy(url: str, section: str) -> Path:
+    """Local folder that stands for an address.
+
+    Args:
+        url: Address of a remote folder, with or without a slash at the end.
+        section: Folder of the cache in which all such folders lie, such as "data".
+    """
+    return cache_folder() / section / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
 
 
 @contextmanager
@@ -276,8 +297,7 @@ def mirror(url: str, names: tuple[str, ...]) -> Path:
     Raises:
         DataError: A file is missing.
     """
-    url = url.rstrip("/")
-    folder = cache_folder() / "data" / hashlib.sha256(url.encode()).hexdigest()[:16]
+    folder, url = local_copy(url, "data"), url.rstrip("/")
     with _locked(folder / ".lock"):
         new = folder / f"{names[-1]}.new"
         remove_temporaries([new, *(folder / name for name in (*names, ORIGIN))])

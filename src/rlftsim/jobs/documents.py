@@ -8,8 +8,7 @@ import math
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from errno import ESPIPE
 from itertools import chain
 from os import PathLike, fspath, fstat, stat
@@ -102,7 +101,10 @@ def parse_json(
     def parse(decoded: str) -> Any:
         try:
             value = json.loads(
-                decoded, parse_float=None if allow_nan else parse_float, parse_constant=parse_float, parse_int=parse_int
+                decoded,
+                parse_float=None if allow_nan else parse_float,
+                parse_constant=parse_float,
+                parse_int=parse_int,
             )
             # every name has a colon; more of them are in texts, or behind a name that is written twice
             if _count_names(value) < decoded.count(":"):
@@ -120,19 +122,16 @@ def parse_json(
     return value
 
 
-def read_toml(
-    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
-) -> dict[str, Any]:
+def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError) -> dict[str, Any]:
     """Values of a TOML file in UTF-8 by name, with or without a mark in front.
 
     Args:
         path: TOML file of at most `MAX_TOML_BYTES`.
         remedy: Way out at the end of every message.
         error: Class of the errors raised.
-        missing: Whole message where there is no such file; empty leaves the message to the caller.
 
     Raises:
-        FileNotFoundError: No such file, and no message for that.
+        FileNotFoundError: No such file; the caller names the file in the message.
         RlftsimError: The file cannot be read, is no TOML, or nests brackets too deeply.
     """
 
@@ -146,7 +145,7 @@ def read_toml(
         except tomllib.TOMLDecodeError as problem:
             raise ValueError(f"not TOML: {problem}") from None
 
-    return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error, missing), parse, str(path), remedy, error)
+    return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error), parse, str(path), remedy, error)
 
 
 def describe_type(value: object) -> str:
@@ -172,51 +171,22 @@ def check_has_end(path: str | PathLike[str]) -> None:
         raise OSError(ESPIPE, "a pipe, not a file")
 
 
-@contextmanager
-def damage_named(
-    path: str | PathLike[str],
-    remedy: str,
-    damage: tuple[type[BaseException], ...],
-    *,
-    error: type[RlftsimError] = DataError,
-    missing: str = "",
-    verdict: str = ": cannot be read",
-    describe: Callable[[BaseException], str] = first_line,
-) -> Iterator[None]:
-    """Turn the errors of a library that reads a file into a line with path, cause and way out; pipes are not read.
-
-    Args:
-        path: File that is read inside the block; a pipe without an end is refused before the block begins.
-        remedy: Way out at the end of the message, such as "write it again".
-        damage: Errors by which the library tells of damaged files; all others pass through unchanged.
-        error: Class of the errors raised in place of the library's, such as CheckpointError.
-        missing: Whole message where there is no such file; empty leaves the message to the caller.
-        verdict: Words between path and cause, such as " is damaged", with the colon or space in front.
-        describe: Function from an error of the library to the cause in a few words.
-
-    Raises:
-        FileNotFoundError: No such file, and no message for that.
-        RlftsimError: Damaged file.
-    """
+def _read_bytes(
+    path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError], missing: str = ""
+) -> bytes:
     try:
         check_has_end(path)
-        yield
-    except FileNotFoundError:
-        if missing:
-            raise error(missing) from None
-        raise
-    except damage as problem:
-        raise error(f"{path}{verdict} ({describe(problem)}): {remedy}.") from None
-
-
-def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError], missing: str) -> bytes:
-    # ValueError: a null byte in the name
-    with damage_named(path, remedy, (OSError, ValueError, ZlibError), error=error, missing=missing):
         with open(path, "rb") as file:
             # a device or a pipe has no size, so the bytes that come are counted, too
             text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None
         if text and text.startswith(_GZIP):
             text = decompressobj(wbits=31).decompress(text, limit + 1)
+    except FileNotFoundError:
+        if missing:
+            raise error(missing) from None
+        raise
+    except (OSError, ValueError, ZlibError) as problem:  # the second: a null byte in the name
+        raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None
     if text is None or len(text) > limit:
         raise error(f"{path}: larger than {limit >> 20} MiB, which no such file is: {remedy}.")
     return text

@@ -110,25 +110,6 @@ class GroupFormat(ResultFormat[range, Stored], Generic[Stored, Result]):
             results: Results of these scenarios, in the same order.
         """
 
-    def do_group(
-        self, work: Callable[[int], Any], group: range, advance: Advance, is_stopped: Callable[[], bool]
-    ) -> None:
-        """Do the scenarios of a group in turn and write the file; an unfinished group leaves no file.
-
-        Args:
-            work: Function from the position of a scenario to the result that the file of the group holds.
-            group: Positions of the scenarios that share a file, done one after another in this order.
-            advance: Function that is called with 1 after each scenario, for the progress bar.
-            is_stopped: Function that returns True once another process has failed, or after Ctrl-C.
-        """
-        results = []
-        for position in group:
-            if is_stopped():
-                return
-            results.append(work(position))
-            advance(1)
-        self.write(group, results)
-
     def count_units(self, item: range) -> int:
         """Number of scenarios, see `ResultFormat`."""
         return len(item)
@@ -151,7 +132,24 @@ def group_task(work: Callable[[int], Result], format: GroupFormat[Any, Result]) 
         work: Function from the position of a scenario to the result; must be picklable for other processes.
         format: Files of the groups.
     """
-    return partial(format.do_group, work)
+    return partial(_do_group, work, format)
+
+
+def _do_group(
+    work: Callable[[int], Any],
+    format: GroupFormat[Any, Any],
+    group: range,
+    advance: Advance,
+    is_stopped: Callable[[], bool],
+) -> None:
+    results = []
+    for position in group:
+        # another process failed, or Ctrl-C: an unfinished group leaves no file
+        if is_stopped():
+            return
+        results.append(work(position))
+        advance(1)
+    format.write(group, results)
 
 
 def run_items(

@@ -187,7 +187,7 @@ class Processes:
             # A closed line is the sign to stop.
             for worker in crew.values():
                 worker.line.close()
-                if not (worker.is_idle or worker.was_ready):  # it has not read the task
+                if worker.is_starting:
                     worker.process.kill()  # it would import everything first, and has written nothing
             for worker in crew.values():
                 worker.process.join()
@@ -235,6 +235,11 @@ class _Worker:
         """Reported since the item was begun."""
         self.since = 0.0
         """Moment at which the item was begun, `time.monotonic`."""
+
+    @property
+    def is_starting(self) -> bool:
+        """True until the process has read the task."""
+        return not (self.is_idle or self.was_ready)
 
     def send(self, message: bytes, item: int | None) -> None:
         """Send the task, or an item of a number."""

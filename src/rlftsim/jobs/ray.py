@@ -138,8 +138,7 @@ class RayRunner:
                     try:
                         event, value, total, seconds, machine = pickle.loads(ray.get(ref))
                     except RayError as error:
-                        first_line = (str(error).strip().splitlines() or [""])[0][:200]
-                        reason = f"{type(error).__name__}: {first_line}"
+                        reason = _reason(error)
                         if self.on_death == "stop":
                             name = describe(items[number])
                             raise DataError(
@@ -224,6 +223,11 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
         error = portable_error(error)
         error.add_note(f"on {machine}")
         return pickle.dumps(("error", error, total, time.monotonic() - start, machine))
+
+
+def _reason(error: RayError) -> str:
+    """First line of Ray's message about the end of a process."""
+    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
 
 
 def _cancel(refs: list[Any]) -> None:

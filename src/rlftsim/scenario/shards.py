@@ -138,10 +138,7 @@ class ShardWriter:
             if error_type is None:
                 self.close()
         finally:
-            # after `close` no file is left; on a full disk closing fails too, because it flushes
-            with suppress(OSError):
-                self._file.close()
-            self._temporary.unlink(missing_ok=True)
+            self.discard()  # after `close` no file is left
 
     def add(self, scenario: Scenario, split: str, source_record: int | None = None) -> None:
         """Append a scenario.
@@ -178,6 +175,12 @@ class ShardWriter:
             self._file.close()
             os.replace(self._temporary, self.path)
 
+    def discard(self) -> None:
+        """Throw away the files written so far."""
+        with suppress(OSError):  # on a full disk closing fails too, because it flushes
+            self._file.close()
+        self._temporary.unlink(missing_ok=True)
+
     def _flush(self) -> None:
         if self._pending:
             with errors_name(self.path):
@@ -198,7 +201,9 @@ class ShardReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            self._table = map_arrow(self.path, _WAY_OUT, missing=f"{self.path} is missing: {_REMEDY}")
+            self._table = map_arrow(self.path, _WAY_OUT)
+        except FileNotFoundError:
+            raise DataError(f"shard {self.path} is missing: {_REMEDY}") from None
         except DataError as error:
             raise DataError(f"shard {error}") from None
         if self._table.schema != _SCHEMA:

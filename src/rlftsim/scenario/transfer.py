@@ -4,8 +4,8 @@ import os
 import shutil
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.buckets import READ_ONLY, fetch, folder_address, mirror, publish, remote_lease, remove
+from rlftsim.errors import DataError
+from rlftsim.jobs.buckets import check_writable, fetch, folder_address, mirror, publish, remote_lease, remove
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.progress import progress_bar
@@ -31,9 +31,7 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
         NotYetError: Another process copies a data set to this address.
     """
     folder, url = Path(folder), folder_address(url)
-    protocol = url.partition("://")[0]
-    if protocol in READ_ONLY:
-        raise ConfigError(f"{url}: {protocol}:// is read only here: upload the folder with that site's own tools.")
+    check_writable(url)
     manifest = read_manifest(folder)
     with remote_lease(url, "is copying to") as renew:
         try:

@@ -8,7 +8,7 @@ from os import PathLike
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
@@ -93,7 +93,10 @@ def read_entry(path: str | PathLike[str], *, account: str | None = None, method:
         ConfigError: A file that is missing, or unknown, missing or placeholder values; the message names the file.
     """
     way_out = "write one as docs/submission.md shows"
-    values = read_toml(path, way_out, error=ConfigError, missing=f"{path}: no such file: {way_out}.")
+    try:
+        values = read_toml(path, way_out, error=ConfigError)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file: {way_out}.") from None
     values |= {name: value for name, value in (("account", account), ("method", method)) if value is not None}
     names = {field.name for field in fields(Entry)}
     missing = [f.name for f in fields(Entry) if f.name not in values and f.default is MISSING]
@@ -238,12 +241,14 @@ def check_closed_loop(policy: Policy, scenario: Scenario) -> None:
             policy.begin(context, 1, None, agent_noise).draws
             for agent_noise in (noise, torch.where(is_ego[:, None], 1 - noise, noise))
         )
-    if draws is None:
-        return
-    # draws for each agent, of which only the ego's differ
-    has_agents = draws.dim() >= 3 and draws.shape[2] == len(is_ego)
-    if not (has_agents and bool((draws[:, :, ~is_ego] == ego_draws[:, :, ~is_ego]).all())):
+    if draws is not None and not _is_ego_alone(draws, ego_draws, is_ego):
         raise ConfigError(
             "the policy draws something at the start of a rollout that the ego shares with other agents: the challenge "
             "wants the ego to be independent of them, because a planner will take its place."
         )
+
+
+def _is_ego_alone(draws: Tensor, ego_draws: Tensor, is_ego: Tensor) -> bool:
+    """True if draws have an agent axis along which only the ego's differ."""
+    has_agents = draws.dim() >= 3 and draws.shape[2] == len(is_ego)
+    return has_agents and bool((draws[:, :, ~is_ego] == ego_draws[:, :, ~is_ego]).all())

@@ -118,8 +118,10 @@ class Vocabulary:
             DataError: The file is missing, damaged or not a vocabulary.
         """
         build = "damaged vocabulary, build it again with `rlftsim tokens`"
-        missing = f"{path}: no such vocabulary: build one with `rlftsim tokens`."
-        tensors, metadata = read_tensors(path, build, missing=missing)
+        try:
+            tensors, metadata = read_tensors(path, build)
+        except FileNotFoundError:
+            raise DataError(f"{path}: no such vocabulary: build one with `rlftsim tokens`.") from None
         if metadata.get("format") != FORMAT:
             raise DataError(f"{path}: not a vocabulary of this version: build one with `rlftsim tokens`.")
         origin = parse_json(metadata.get("origin", ""), build, source=f"{path}: origin", expected=str)
