@@ -102,6 +102,22 @@ def test_pages_of_several_sets_of_a_scenario_are_numbered(scenario, tmp_path):
     assert [page.name for page in pages] == ["junction.html", "junction-2.html", "junction-3.html"]
 
 
+def killed_after_the_first(function):
+    """The function, which ends the process in the middle of its second call, or of its first file."""
+    calls = []
+
+    def call(path, rest):
+        calls.append(path)
+        if function.__name__ == "remove_folder":
+            function(path, list(rest)[:1])
+            raise KeyboardInterrupt
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return function(path, rest)
+
+    return call
+
+
 def test_pages_by_shares_and_after_an_interruption_are_the_same(scenario, tmp_path, capsys, monkeypatch):
     write_dataset([scenario, scenes.lone_agent(), scenes.without_road_edges()], tmp_path / "data")
     (tmp_path / "rollouts").mkdir()
@@ -136,6 +152,14 @@ def test_pages_by_shares_and_after_an_interruption_are_the_same(scenario, tmp_pa
     assert "junction.html has to be made again: its end is missing" in capsys.readouterr().err
     assert main([*words("shared"), "--jobs", "1", "--share", "1/2"]) == 0
     assert files("shared") == files("whole")
+    # killed while the finished pages are put in their places, and while the rest is cleared away
+    for name in ("write_atomically", "remove_folder"):
+        assert main([*words(name), "--jobs", "1", "--share", "1/2"]) == 0
+        with monkeypatch.context() as patch:
+            patch.setattr(explain_page, name, killed_after_the_first(getattr(explain_page, name)))
+            assert main([*words(name), "--jobs", "1", "--share", "2/2"]) == 130
+        assert main([*words(name), "--jobs", "1", "--share", "2/2"]) == 0
+        assert files(name) == files("whole")
     # the second page fails; the first is not made again
     explained, original = [], explain_page.explain
 

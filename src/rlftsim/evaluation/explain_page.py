@@ -1,6 +1,7 @@
 """Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms."""
 
 import hashlib
+import shutil
 from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
@@ -18,7 +19,7 @@ from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogr
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
-from rlftsim.jobs.files import remove_folder, write_text
+from rlftsim.jobs.files import remove_folder, write_atomically, write_text
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Runner, choose_runner
@@ -113,15 +114,23 @@ def write_files(
         SetAside, Unfinished: See `run_items`.
     """
     folder = out / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
+    done = folder.with_suffix(".done")
+    if done.exists():  # left by a call that was killed at the very end: a share would begin its files anew, alone
+        remove_folder(done, items)
+        if not done.exists():
+            return [out / name for name in items if (out / name).exists()]
     with Lease(folder / ".lock", runner, "works in") as lease:
         finished = run_items(
             title, list(items.items()), partial(_write_file, write, folder), lease=lease, runner=runner,
             format=WholeFiles(folder, itemgetter(0), _read_page),
         )  # fmt: skip
-        written = [file.replace(out / file.name) for file in finished if file.stat().st_size]
+        files = [file for file in finished if file.stat().st_size]
+        for file in files:
+            write_atomically(out / file.name, partial(shutil.copyfile, file))
         lease.remove()
-        remove_folder(folder, items)
-    return written
+        # renamed at once: what is gone from the folder is done again
+        remove_folder(folder if done.exists() else folder.rename(done), items)
+    return [out / file.name for file in files]
 
 
 def _write_file(
