@@ -1,6 +1,7 @@
 """A calibrated policy is a policy like any other, and with eta 0 it is its base."""
 
 import copy
+import pickle
 
 import pytest
 import torch
@@ -87,6 +88,13 @@ def test_values_of_features_stay_within_their_bounds(base):
         values = feature(dist._candidates)
         assert feature.low <= values.min()
         assert values.max() <= feature.high
+
+
+def test_other_processes_have_the_same_policy(calibrated):
+    sent = pickle.loads(pickle.dumps(calibrated))
+    batch = collate([SCENES[0]])
+    here, there = (simulate(policy, batch, num_rollouts=2, seed=0) for policy in (calibrated, sent))
+    assert torch.equal(here.position, there.position)
 
 
 def test_what_all_candidates_share_changes_nothing(base):

@@ -56,9 +56,22 @@ class Feature:
             )
         return values.clamp(self.low, self.high)
 
+    def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
+        """Other processes look the feature up by name: a function in a line is not pickled."""
+        return find_feature, (self.name,)
+
 
 FEATURES = ExtensionPoint[Feature]("feature", "rlftsim.features", use=lambda name: features_by_name([name]))
 """Features by name, this package's and others'."""
+
+
+def find_feature(name: str) -> Feature:
+    """The feature of a name.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    return FEATURES.get(name)
 
 
 def register_feature(
