@@ -36,6 +36,7 @@ NO_FORMAT = {
     "policies.shipped.__init__": "weights in the box",
     "scenario.synthetic.bodies": "what SUMO has just written",
     "evaluation.explain_page": "whether a page that it moves has an end",
+    "evaluation.report": "a picture of this program, which it does not look at",
     "experiments.paper.published": "the paper's tables in the box",
     "jobs.buckets": "copies bytes that it does not look at",
     "studio.server": "the page in the box",

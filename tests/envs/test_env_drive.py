@@ -229,7 +229,7 @@ def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys
     assert main(["compare", str(first), str(second)]) == 0
     text = capsys.readouterr().out
     assert "nuplan_style" in text
-    assert "2 scenarios" in text
+    assert "2 scenarios in both" in " ".join(text.split())
     assert main(["drive", "walk", "--data", "synthetic", "--out", str(out)]) == 2
     assert main([*words, "--traffic", "none"]) == 2
     assert main([*words, "--scenario", "x", "--traffic", "replay"]) == 2

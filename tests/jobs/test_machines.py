@@ -47,11 +47,12 @@ def test_work_that_is_killed_at_random_moments_ends_with_the_same_bytes(tmp_path
     command = [sys.executable, ROOT / "benchmarks" / "kills.py", tmp_path, "--kills", "10", "--scenarios", "8"]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:]]
+    lines = [line for line in done.stdout.splitlines() if line.startswith("| ")]
+    rows = [line.split("|")[1:-1] for line in lines[1:]]
     assert [(row[0].strip(), row[1].strip()) for row in rows] == [
         (backend, name)
         for backend in ("inline", "processes", "shares")
-        for name in ("convert", "evaluate", "simulate", "augment", "submit build")
+        for name in ("convert", "evaluate", "simulate", "augment", "score --explain", "submit build")
     ]
     for row in rows:
         *kills, num_rounds, different = (int(cell) for cell in row[2:])

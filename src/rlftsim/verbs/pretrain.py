@@ -169,16 +169,14 @@ def pretrain(
         if recipe is not None:
             # without a vocabulary all that recipes of other packages may know
             replaced: Any = () if tokens is None else (tokens, keep_tokens)
-            learner = _to_recipe_like(recipe, learner).train_further(learner, *replaced)
+            like = recipe if isinstance(recipe, Recipe) else _to_recipe_like(recipe_by_name(recipe), learner)
+            learner = like.train_further(learner, *replaced)
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
     limits: Any = {"max_updates": max_updates, "on_update": on_update, "tracker": tracker}
     return train(learner, training, out, settings, device=device, held_out=validation, card=card, **limits)
 
 
-def _to_recipe_like(recipe: Recipe | str, policy: Policy) -> Recipe:
-    """Recipe for policies of the sizes of an existing one; a recipe that is handed over has them already."""
-    if isinstance(recipe, Recipe):
-        return recipe
-    named = recipe_by_name(recipe)
+def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:
+    """Recipe for policies of the sizes of an existing one."""
     # A recipe of another package may know no models but its own: those are trained further as they are.
-    return named if type(named).like is Recipe.like else named.like(policy)
+    return recipe if type(recipe).like is Recipe.like else recipe.like(policy)
