@@ -317,8 +317,8 @@ def _scenarios_html(table: ScenarioTable) -> str:
 
 def _picture_html(path: Path, title: str) -> str:
     """The picture inside of the page, so that the page stays a single file."""
-    data = b64encode(path.read_bytes()).decode()
-    return f'<p><img class="card" style="max-width: 100%" src="data:image/png;base64,{data}" alt="{escape(title)}"></p>'
+    source = f"data:image/png;base64,{b64encode(path.read_bytes()).decode()}"
+    return f'<p><img class="card" style="width: min(100%, 640px)" src="{source}" alt="{escape(title)}"></p>'
 
 
 def _link(address: str, text: str) -> str:
