@@ -160,6 +160,9 @@ def test_pages_by_shares_and_after_an_interruption_are_the_same(scenario, tmp_pa
             assert main([*words(name), "--jobs", "1", "--share", "2/2"]) == 130
         assert main([*words(name), "--jobs", "1", "--share", "2/2"]) == 0
         assert files(name) == files("whole")
+        # a share that is repeated behind the end has nothing to do
+        assert main([*words(name), "--jobs", "1", "--share", "1/2"]) == 0
+        assert files(name) == files("whole")
     # the second page fails; the first is not made again
     explained, original = [], explain_page.explain
 

@@ -22,7 +22,7 @@ from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_
 from rlftsim.jobs.files import remove_folder, write_atomically, write_text
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
-from rlftsim.jobs.runner import Advance, Runner, choose_runner
+from rlftsim.jobs.runner import Advance, Joining, Runner, Share, choose_runner
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
 from rlftsim.viewer.chart import Chart, Curve, chart_html
@@ -105,7 +105,8 @@ def write_files(
         title: Name of the work, in front of the progress bar.
         items: Items by name of the file, such as "a.html".
         write: Function that writes the file of an item, whole or not at all; picklable for other processes.
-        out: Folder of the files, made if missing. Unfinished work lies in a folder of its own inside.
+        out: Folder of the files, made if missing. Unfinished work lies in a folder of its own inside. Shares leave an
+            empty folder there, by which a share that is repeated knows that all is done.
         identity: Text that is equal for the same work.
         runner: Runner of the items.
 
@@ -114,11 +115,13 @@ def write_files(
         SetAside, Unfinished: See `run_items`.
     """
     folder = out / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
-    done = folder.with_suffix(".done")
-    if done.exists():  # left by a call that was killed at the very end: a share would begin its files anew, alone
+    done, is_shared = folder.with_suffix(".done"), isinstance(runner, Share | Joining)
+    if done.exists():
         remove_folder(done, items)
-        if not done.exists():
-            return [out / name for name in items if (out / name).exists()]
+        written = [out / name for name in items if (out / name).exists()]
+        if is_shared and written:  # a share alone would begin its files anew, and leave them
+            done.mkdir(exist_ok=True)
+            return written
     with Lease(folder / ".lock", runner, "works in") as lease:
         finished = run_items(
             title, list(items.items()), partial(_write_file, write, folder), lease=lease, runner=runner,
@@ -130,6 +133,8 @@ def write_files(
         lease.remove()
         # renamed at once: what is gone from the folder is done again
         remove_folder(folder if done.exists() else folder.rename(done), items)
+        if is_shared:
+            done.mkdir(exist_ok=True)
     return [out / file.name for file in files]
 
 
