@@ -339,7 +339,7 @@ def copy_planner(planner: Planner) -> Planner:
         raise ConfigError(
             f"planner {name} cannot be copied ({type(error).__name__}: {in_short(str(error))}), so no branch can go on "
             "with its memory: give it a method copy()."
-        ) from None
+        ) from error
     return copied
 
 

@@ -53,7 +53,7 @@ class Sb3Planner:
             raise ConfigError(
                 f"sb3:{path} is no policy of PPO or A2C with MlpPolicy, or with DriverView ({first_line(error)}): "
                 f"{WAY_OUT}."
-            ) from None
+            ) from error
 
     def _build_policy(self, weights: dict[str, Tensor], settings: dict[str, Any]) -> ActorCriticPolicy:
         pattern = re.compile(r"mlp_extractor\.(policy|value)_net\.\d+\.weight")

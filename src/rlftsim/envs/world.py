@@ -256,9 +256,8 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         moved_states = []
         for b, (scene, lines) in enumerate(zip(world.scenes, world.lines)):
             agents = b, slice(len(scene.object_id))
-            there, z = present[agents], state.z[-1][agents]
             idm_state, motion[b, lines.agents] = advance_idm(
-                lines, idm_states[b], previous[agents], z, there, scene, following - 1, IDM
+                lines, idm_states[b], previous[agents], state.z[-1][agents], present[agents], scene, following - 1, IDM
             )
             moved_states.append(idm_state)
         idm_states = tuple(moved_states)

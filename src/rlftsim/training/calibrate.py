@@ -280,8 +280,9 @@ class CalibrationLearner(Learner):
         rows = torch.zeros(len(positions), len(self.names), dtype=torch.float64, device=fabric.device)
         for batch_positions in batches:
             batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, stage, fabric)
-            values = {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in CONSTRAINTS.items()}
-            values |= {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
+            values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
+            rules = {name: rule for name, rule in CONSTRAINTS.items() if name not in MEASURED}
+            values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in rules.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
             rows[[positions.index(position) for position in batch_positions]] = torch.stack(
                 [values[name].double() for name in self.names], -1

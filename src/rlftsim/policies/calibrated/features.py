@@ -199,13 +199,13 @@ class TiltedDistribution(CategoricalDistribution):
     def values(self) -> Float[Tensor, "P K"]:
         """Features of all candidates, minus those of the agent's likeliest token: what all candidates of an agent share
         would else lift the tokens that are none."""
-        candidates = self._candidates
+        candidates, (row, _, _) = self._candidates, self._pairs
         values = torch.stack([feature(candidates) for feature in self.features], -1)
+        # of tokens that are equally likely the first, whatever the device
         likeliest = (candidates.log_ratio == 0).nonzero()[:, 0]
-        first = likeliest.new_full((self._num_rows,), len(values)).scatter_reduce(
-            0, self._pairs[0][likeliest], likeliest, "amin"
-        )
-        return (values - values[first[self._pairs[0]]]) * candidates.weight[:, None]
+        first = likeliest.new_full((self._num_rows,), len(values))
+        first = first.scatter_reduce(0, row[likeliest], likeliest, "amin")  # position among the pairs: [R]
+        return (values - values[first[row]]) * candidates.weight[:, None]
 
     def score_function(self, decision: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
         """Gradient of the decisions' log-probability by eta: the features of the chosen token minus the mean of all.
