@@ -642,7 +642,7 @@ def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys)
             "--finetune.reward has no effect with --method catk: its settings are --catk.*",
         ),
         (
-            ["--catk.num_candidates", "4"],
+            ["--method", "rlft", "--catk.num_candidates", "4"],
             "--catk.num-candidates has no effect with --method rlft: its settings are --finetune.*",
         ),
         ([*catk, "--catk.choice", "farthest"], "expected one of 'closest', 'top_k', 'trajeglish'"),

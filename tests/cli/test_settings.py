@@ -82,7 +82,7 @@ def test_flags_leave_everything_else_as_the_recipe_has_it():
     changed = settings_of([*FINETUNE, "--finetune.kl.target", "0.02"])
     recipe = recipe_by_name("smart-demo")
     kl = replace(recipe.finetune.kl, target=0.02)
-    assert changed == replace(recipe, finetune=replace(recipe.finetune, kl=kl))
+    assert changed == replace(recipe, method="rlft", finetune=replace(recipe.finetune, kl=kl))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ BAD = [
     ([*FINETUNE, "--finetune.reward", "joy"], "unknown reward 'joy'"),
     ([*FINETUNE, "--finetune.num-rollouts", "1"], "at least 2 rollouts"),
     ([*FINETUNE, "--finetune.kl.target", "0"], "finetune.kl: target must be positive"),
-    ([*FINETUNE, "--catk.choice", "closest"], "--catk.choice has no effect with --method rlft"),
+    ([*FINETUNE, "--method", "rlft", "--catk.choice", "closest"], "--catk.choice has no effect with --method rlft"),
     ([*FINETUNE, "--method", "gcsl", "--finetune.seed", "1"], "--finetune.seed has no effect with --method gcsl"),
     ([*TOKENS, "--tokens.trajtok.vehicle.x-max-m", "inf"], "x_max_m must be a finite number"),
     ([*EXPERIMENT, "--finetune.reward", "rloo"], "--finetune.reward has no effect: experiments vary it"),
@@ -205,8 +205,9 @@ def test_a_printed_recipe_is_read_back(name, tmp_path, capsys):
 def test_the_text_of_a_recipe_has_every_field_and_its_documentation():
     recipe = recipe_by_name("smart-tiny")
     text = recipe_as_text(recipe)
-    for name in flatten(to_plain(recipe)):
+    for name in flatten(to_plain(list_sections(recipe))):
         assert f"  {name.rpartition('.')[2]}: " in text
+    assert "method: rlft" in text.splitlines()
     assert "# Rollouts per scenario and update (N).\n  num_rollouts: 4" in text
     assert list(json.loads(recipe_as_json(recipe))) == list(list_sections(recipe))
 
@@ -233,12 +234,28 @@ def test_a_runs_config_is_read_by_its_method(tmp_path):
     path.write_text(
         json.dumps({"num_candidates": 7, "goal_probability": 0.5, "initial_policy": "ab", "scenarios": "cd"})
     )
-    settings = settings_of([*FINETUNE, "--method", "catk", "--config", str(path)])
-    assert (settings.catk.num_candidates, settings.catk.goal_probability) == (7, 0.5)
+    for words in (["--method", "catk"], []):
+        settings = settings_of([*FINETUNE, *words, "--config", str(path)])
+        assert (settings.method, settings.catk.num_candidates, settings.catk.goal_probability) == ("catk", 7, 0.5)
     with pytest.raises(
         ConfigError, match=r"config\.json: no setting finetune\.goal_probability: did you mean finetune\."
     ):
-        parse([*FINETUNE, "--config", str(path)])
+        parse([*FINETUNE, "--method", "rlft", "--config", str(path)])
+
+
+@pytest.mark.parametrize(
+    ("words", "method"),
+    [
+        ([], "calibrate"),
+        (["--goal", "concat"], "rlft"),
+        (["--finetune.epochs", "2"], "rlft"),
+        (["--catk.epochs=2"], "catk"),
+        (["--method", "road", "--road.epochs", "2"], "road"),
+    ],
+)
+def test_the_method_is_that_whose_settings_are_given_or_that_of_the_recipe(words, method):
+    assert settings_of([*FINETUNE, *words]).method == method
+    assert settings_of(["finetune", "smart-tiny", *FINETUNE[2:]]).method == "rlft"
 
 
 @pytest.mark.parametrize(

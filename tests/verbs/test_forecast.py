@@ -43,7 +43,9 @@ def measured(monkeypatch):
     return words_of_runs
 
 
-def test_updates_time_and_memory_are_those_of_the_command_itself(measured, monkeypatch, capsys):
+def test_updates_time_and_memory_are_those_of_the_command_itself(measured, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.json").write_text('{"finetune": {"epochs": 3.0}}')
     monkeypatch.setattr(forecast, "find_memory", lambda: 100 * GB)
     words = ["doctor", "--plan", "finetune", "--recipe", "smart-demo", "--data", "synthetic", "--measure", "2"]
     assert main([*words, "--model", "runs/base", "--config", "mine.json"]) == 0

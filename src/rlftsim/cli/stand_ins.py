@@ -13,9 +13,19 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
-KEPT = {*sys.stdlib_module_names, "numpy"}
+KEPT = {*sys.stdlib_module_names}
 """Packages that cannot hold a stand-in: they import no slow library. numpy also refuses to be loaded twice."""
-SLOW = ("torch", "lightning_fabric", "scipy", "matplotlib", "pyarrow", "safetensors", "PIL", "imageio_ffmpeg")
+ENGINES = (
+    *("realism", "viewer", "scenario.womd_pb2", "evaluation.submission_pb2", "evaluation.explain", "training.run"),
+    *("policies.smart.policy", "policies.trafficbots.policy", "evaluation.learning_curve", "rollout.simulate"),
+    *("training.trackers", "evaluation.evaluate", "evaluation.compare", "evaluation.explain_page", "recipes.train"),
+    *("evaluation.scenario_source", "evaluation.rollout_files", "evaluation.resumable", "scenario.inspect"),
+)
+"""Modules of this package that do the work, and have no setting and no flag."""
+SLOW = (
+    *("torch", "numpy", "jaxtyping", "google", "lightning_fabric", "scipy", "matplotlib", "pyarrow", "safetensors"),
+    *("PIL", "imageio_ffmpeg", *(f"rlftsim.{name}" for name in ENGINES)),
+)
 
 
 class _AnyClass(type):
@@ -30,6 +40,12 @@ class _AnyClass(type):
         return _Anything
 
     __ror__ = __or__
+
+    def __iter__(cls) -> Iterator[Any]:
+        return iter(())
+
+    def __len__(cls) -> int:
+        return 0
 
 
 class _Anything(metaclass=_AnyClass):
@@ -64,6 +80,15 @@ class _Anything(metaclass=_AnyClass):
     def __len__(self) -> int:
         return 0
 
+    def __float__(self) -> float:
+        return 0.0
+
+
+for _operation in ("mul", "truediv", "floordiv", "sub", "add"):
+    for _name in (f"__{_operation}__", f"__r{_operation}__"):
+        setattr(_AnyClass, _name, lambda self, other: _Anything)
+        setattr(_Anything, _name, lambda self, other: self)
+
 
 class _EmptyModule(ModuleType):
     __path__: Sequence[str] = ()
@@ -78,7 +103,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Finds an empty module for every slow library and each of its submodules."""
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> Any:
-        is_slow = fullname.partition(".")[0] in SLOW
+        is_slow = any(fullname == name or fullname.startswith(f"{name}.") for name in SLOW)
         return importlib.machinery.ModuleSpec(fullname, self, is_package=True) if is_slow else None
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:

@@ -91,7 +91,8 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         policy = recipe.new_policy(vocabulary)
         base = pretrain_policy(policy, training, recipe.pretrain, out / "pretrain")
     with stage("fine-tuning: closed loop, MLOO reward, calibration at unchanged speed"):
-        tuned = finetune_model(base, training, recipe.calibrate or recipe.finetune, out / "finetune")
+        settings = recipe.calibrate if recipe.method == "calibrate" else recipe.finetune
+        tuned = finetune_model(base, training, settings, out / "finetune")
     with stage(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
         # Both models from their folders, as `rlftsim evaluate` would load them.
         policies = {BASE: load_policy(str(base)), TUNED: load_policy(str(tuned))}

@@ -43,6 +43,8 @@ class Recipe:
 
     model_name: ClassVar[str] = "model"
     """Name of the recipe's models in tables."""
+    method: str = "rlft"
+    """Method of fine-tuning where none is named."""
     tokens: TokensConfig | None = None
     """Vocabulary; None for policies without one."""
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
@@ -111,7 +113,7 @@ class Recipe:
         return policy
 
     def with_goals(self) -> "Recipe":
-        """The same recipe for goal-conditioned fine-tuning: every agent's goal is the logged endpoint, the
+        """The same recipe for goal-conditioned fine-tuning by rlft: every agent's goal is the logged endpoint, the
         reward is `gcft`.
 
         CAT-K and RoaD, if in the recipe, then train the goal-conditioned weights alone.
@@ -121,7 +123,7 @@ class Recipe:
         catk, road = (
             method and replace(method, goal_probability=1.0, trained="goals") for method in (self.catk, self.road)
         )
-        return replace(self, finetune=finetune, catk=catk, road=road)
+        return replace(self, method="rlft", finetune=finetune, catk=catk, road=road)
 
     def with_section(self, name: str, section: Any) -> Any:
         """The same recipe with a further section, such as the settings of an installed package's training method.

@@ -2,8 +2,10 @@
 
 import ast
 import inspect
-import textwrap
+import linecache
+from collections.abc import Iterator
 from dataclasses import is_dataclass
+from functools import cache
 from itertools import pairwise
 
 
@@ -18,7 +20,7 @@ def read_field_texts(config: type) -> dict[str, str]:
     for owner in reversed(config.__mro__):
         if not is_dataclass(owner):
             continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
+        body = _parse_classes(inspect.getsourcefile(owner) or "")[owner.__qualname__]
         # A field's docstring is the string that follows it; at run time it is gone, so the source is read.
         for statement, following in pairwise(body):
             if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
@@ -26,3 +28,18 @@ def read_field_texts(config: type) -> dict[str, str]:
             if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
                 documentation[statement.target.id] = " ".join(str(following.value.value).split())
     return documentation
+
+
+@cache
+def _parse_classes(path: str) -> dict[str, list[ast.stmt]]:
+    """Statements of the classes in a source file, by qualified name. `inspect.getsource` parses the file for each."""
+    return dict(_walk_classes(ast.parse("".join(linecache.getlines(path))).body, ""))
+
+
+def _walk_classes(statements: list[ast.stmt], prefix: str) -> Iterator[tuple[str, list[ast.stmt]]]:
+    for statement in statements:
+        if isinstance(statement, ast.ClassDef):
+            yield prefix + statement.name, statement.body
+            yield from _walk_classes(statement.body, f"{prefix}{statement.name}.")
+        elif isinstance(statement, ast.FunctionDef):
+            yield from _walk_classes(statement.body, f"{prefix}{statement.name}.<locals>.")

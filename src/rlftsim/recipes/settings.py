@@ -23,10 +23,12 @@ def recipe_as_json(recipe: Recipe) -> str:
 
 def recipe_as_text(recipe: Recipe) -> str:
     """A recipe with the documentation of every field as a comment above, in the notation of YAML."""
-    return "\n\n".join(
+    method = f"# {read_field_texts(Recipe)['method']}\nmethod: {recipe.method}"
+    sections = [
         "\n".join([f"# {summarize_docstring(type(section))}", f"{name}:", *_write_lines(section, "  ")])
         for name, section in list_sections(recipe).items()
-    )
+    ]
+    return "\n\n".join([method, *sections])
 
 
 def list_sections(recipe: Recipe) -> dict[str, Any]:
@@ -61,7 +63,7 @@ def read_flags(path: Path, recipe: Recipe, sections: Sequence[str], run_section:
         ConfigError: A file that cannot be read, or an unknown setting; the message has the nearest known name.
     """
     # 1. sections by name
-    values = _read_mapping(path)
+    values = read_settings(path)
     run_fields = [field.name for field in fields(getattr(recipe, run_section))]
     is_run, is_recipe = set(values) & {*run_fields, *RUN_INPUTS}, set(values) & {*SECTIONS, *section_names(recipe)}
     # A run's config.json holds one section without its name; a printed recipe holds sections by name. A single
@@ -108,7 +110,12 @@ def to_flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
     return [f"--{group}{dot}{last}", *(str(item) for item in values)]
 
 
-def _read_mapping(path: Path) -> dict[str, Any]:
+def read_settings(path: Path) -> dict[str, Any]:
+    """Values of a file of settings, such as the config.json of a run.
+
+    Raises:
+        ConfigError: No such file, or no JSON.
+    """
     way_out = "`rlftsim recipe NAME --json` prints one"
     if not path.is_file():
         problem = "a folder, not a file" if path.is_dir() else "no such file"

@@ -117,7 +117,7 @@ def smart_nano_rlftsim() -> SmartRecipe:
 
 def smart_demo_rlftsim() -> SmartRecipe:
     """Minutes on two CPU cores, for a few hundred scenarios: a small model, many small pre-training updates,
-    large fine-tuning steps."""
+    calibration."""
     # Few scenarios mean few updates, so steps are larger than the paper's; all agents are trained on. Averaged weights
     # and standing tokens that count less save three of ten passes. With credit by agent traffic stays nearer to the log
     # than with the paper's at the same realism, and without the last two settings of fine-tuning it gets much slower.
@@ -126,6 +126,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
         checkpoint_every=20,
     )  # fmt: skip
     return SmartRecipe(
+        method="calibrate",
         tokens=TokensConfig(num_tokens=1024, num_map_prototypes=256),
         model=smart_demo(),
         pretrain=PretrainConfig(
@@ -186,4 +187,5 @@ def smart_demo_quick() -> SmartRecipe:
 def smart_synthetic() -> SmartRecipe:
     """Experiments on the synthetic scenarios: the demo, fine-tuned with the paper's objective alone."""
     recipe = smart_demo_rlftsim()
-    return replace(recipe, finetune=replace(recipe.finetune, imitation_weight=0.0, hold_speed=False))
+    objective = replace(recipe.finetune, imitation_weight=0.0, hold_speed=False)
+    return replace(recipe, method="rlft", finetune=objective)

@@ -63,7 +63,7 @@ def doctor(
         recipe: Recipe of the training, with --plan finetune or pretrain.
         vocabulary: Vocabulary of the training, with --plan pretrain.
         config: File of settings of the training, with --plan finetune or pretrain.
-        method: Method of fine-tuning, such as calibrate, with --plan finetune; left out, rlft.
+        method: Method of fine-tuning, such as rlft, with --plan finetune; left out, the recipe's.
         measure: Number of scenarios to measure, of all sizes; with --plan finetune or pretrain of updates.
         num_scenarios: Scenarios of the whole work, with --plan. Left out: 576000 to convert, 44100 to evaluate, 44920
             to submit.

@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.settings import list_sections, read_settings
 from rlftsim.recipes.train import GoalConditioning, describe_method, prepare_policy, with_conditioning
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.open import to_scenarios
@@ -23,6 +25,7 @@ from rlftsim.training.config import (
 )
 from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, OnUpdate, Processes, Settings
+from rlftsim.verbs.commands import FINETUNING
 from rlftsim.verbs.inputs import check_config, to_recipe
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
 from rlftsim.verbs.runs import print_model, repeat_for_seeds
@@ -44,11 +47,42 @@ def adapt_flags(flags: RecipeFlags, words: Sequence[str]) -> RecipeFlags:
         flags: Flags of the recipe.
         words: Words behind the command.
     """
-    method = find_value("--method", words) or "rlft"
+    method = choose_method(flags.recipe, words)
     section = find_section(method)
     sections = tuple(dict.fromkeys((*flags.sections, section)))
     recipe = _complete_recipe(flags.recipe, section, has_goals=bool(find_value("--goal", words)))
+    recipe = replace(recipe, method=method)
     return replace(flags, recipe=recipe, sections=sections, file_sections=sections, run_section=section)
+
+
+def choose_method(recipe: Recipe, words: Sequence[str]) -> str:
+    """Method of a command line: the named one, else the one whose settings are given, else rlft with goals, else the
+    recipe's.
+
+    Args:
+        recipe: Recipe whose method is the last resort.
+        words: Words behind the command.
+
+    Raises:
+        ConfigError: A file of settings that cannot be read.
+    """
+    if name := find_value("--method", words):
+        return name
+    given = [section for section in FINETUNING if any(word.startswith(f"--{section}.") for word in words)]
+    if not given and (file := find_value("--config", words)):
+        given = _find_sections(read_settings(Path(file)), recipe)
+    if len(given) == 1:
+        return "rlft" if given[0] == "finetune" else given[0]
+    return "rlft" if find_value("--goal", words) else recipe.method
+
+
+def _find_sections(values: Mapping[str, Any], recipe: Recipe) -> list[str]:
+    """Sections of fine-tuning in a file: of a printed recipe by name, of a run's config.json the one that has most of
+    the fields."""
+    present = {name: section for name, section in list_sections(recipe).items() if name in FINETUNING}
+    named = [name for name in present if name in values]
+    counts = {name: sum(entry.name in values for entry in fields(section)) for name, section in present.items()}
+    return named or [max(counts, key=counts.__getitem__)]
 
 
 def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str]) -> None:
@@ -62,9 +96,9 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
     Raises:
         ConfigError: A flag has no effect, or the recipe has no settings of the method.
     """
-    method, goal, bias = values["method"], values["goal"], values["goal_logit_bias"]
+    method, goal, bias = recipe.method, values["goal"], values["goal_logit_bias"]
     section = find_section(method)
-    other_sections = [name for name in ("finetune", "catk", "road", "gcsl", "calibrate") if name != section]
+    other_sections = [name for name in FINETUNING if name != section]
     check_no_settings(flags, other_sections, f"with --method {method}: its settings are --{section}.*")
     if goal is None and bias is not None:
         flag = "--goal-logit-bias" if bias else "--no-goal-logit-bias"
@@ -82,7 +116,7 @@ def finetune(
     config: Settings | None = None,
     *,
     recipe: AnyRecipe | None = None,
-    method: Annotated[str, tyro.conf.arg(metavar="rlft|catk|road|gcsl|calibrate|NAME")] = "rlft",
+    method: Annotated[str | None, tyro.conf.arg(metavar="rlft|catk|road|gcsl|calibrate|NAME")] = None,
     goal: Literal["concat", "indication"] | None = None,
     goal_logit_bias: Annotated[bool | None, tyro.conf.arg(metavar="/ --no-goal-logit-bias")] = None,
     processes: Processes = None,
@@ -118,13 +152,14 @@ def finetune(
         recipe: Settings to start from; `rlftsim recipe` lists all recipes. The flags below change single fields. The
             model brings its own architecture, so any recipe fits any model. In Python also a recipe itself; left out,
             the paper's settings.
-        method: Training method. rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised
-            fine-tuning along rollouts that choose the token closest to the log among the top K, fields catk.*. road:
-            supervised fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the
-            goal-conditioned weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft
-            with goals (--model OUT), fields gcsl.*. calibrate: fit the weights of a few named features on the token
-            logits, no weight of the model, to a realism reward without a change of speed, fields calibrate.*. Another
-            NAME: the method that another package has registered, fields NAME.*.
+        method: Training method. Left out: the method whose settings are given, rlft with goals, else the recipe's: for
+            models of the demo's size calibrate, for others the paper's rlft. rlft: policy gradient on a realism reward,
+            fields finetune.*. catk: supervised fine-tuning along rollouts that choose the token closest to the log
+            among the top K, fields catk.*. road: supervised fine-tuning on the model's own rollouts, guided by the log,
+            fields road.*. gcsl: train the goal-conditioned weights on the model's own rollouts, relabelled with their
+            endpoints, as a start for rlft with goals (--model OUT), fields gcsl.*. calibrate: fit the weights of a few
+            named features on the token logits, no weight of the model, to a realism reward without a change of speed,
+            fields calibrate.*. Another NAME: the method that another package has registered, fields NAME.*.
         goal: Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
             --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
             weights alone. Left out, the model keeps the goal conditioning it has.
@@ -186,17 +221,19 @@ def find_section(method: str) -> str:
     return "finetune" if method == "rlft" else method
 
 
-def _choose_settings(recipe: AnyRecipe | None, method: str, *, has_goals: bool) -> Any:
-    """Settings of a method, of a recipe or the paper's.
+def _choose_settings(recipe: AnyRecipe | None, method: str | None, *, has_goals: bool) -> Any:
+    """Settings of a method, of a recipe or the paper's; None = the recipe's method, with goals rlft.
 
     Raises:
         ConfigError: The recipe has none.
     """
     base = Recipe(road=RoadConfig(), calibrate=CalibrateConfig()) if recipe is None else to_recipe(recipe)
     # a recipe that is handed over has what it should have
-    if not isinstance(recipe, Recipe):
+    is_complete = isinstance(recipe, Recipe)
+    method = method or ("rlft" if has_goals and not is_complete else base.method)
+    if not is_complete:
         base = _complete_recipe(base, find_section(method), has_goals=has_goals)
-    return _find_settings(base, type(base).__name__ if isinstance(recipe, Recipe) else recipe, method)
+    return _find_settings(base, type(base).__name__ if is_complete else recipe, method)
 
 
 def _complete_recipe(recipe: Recipe, section: str, *, has_goals: bool) -> Recipe:

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,12 +17,13 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, shorten
 from rlftsim.jobs.progress import log
+from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.training.parallel import scenario_costs
 from rlftsim.training.registry import method_by_name
 from rlftsim.training.run_folder import flatten, read_metrics, stored_settings
-from rlftsim.verbs.finetune import find_section
+from rlftsim.verbs.finetune import choose_method
 
 WARM_UP = 1
 """Updates that are not counted: they import, and fill caches."""
@@ -45,12 +47,13 @@ class TrainingCommand:
     config: str | None = None
     """File of settings."""
     method: str | None = None
-    """Method of fine-tuning; None = rlft."""
+    """Method of fine-tuning; None = as the settings or the recipe say."""
 
-    @property
-    def section(self) -> str:
-        """Section of the recipe with the settings of the training."""
-        return "pretrain" if self.verb == "pretrain" else find_section(self.method or "rlft")
+    @cached_property
+    def trainer(self) -> str:
+        """Method of training."""
+        words = self.write_words(self.data, Path())
+        return "pretrain" if self.verb == "pretrain" else choose_method(recipe_by_name(self.recipe), words)
 
     def write_words(self, data: str | Path, out: Path, micro_batch: int | None = None) -> list[str]:
         """Words of the command line.
@@ -65,7 +68,10 @@ class TrainingCommand:
         flags = {"--vocabulary": self.vocabulary, "--config": self.config, "--method": self.method}
         for flag, value in {model_flag: self.model, **flags}.items():
             words += [flag, value] if value is not None else []
-        return words + ([f"--{self.section}.micro-batch-size", str(micro_batch)] if micro_batch else [])
+        if micro_batch is None:
+            return words
+        section = "finetune" if self.trainer == "rlft" else self.trainer
+        return [*words, f"--{section}.micro-batch-size", str(micro_batch)]
 
 
 @dataclass(frozen=True)
@@ -132,8 +138,7 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
     counted: Any = {name: value for name, value in run.settings.items() if name in COUNTED}
     if "lengths" in counted:  # JSON has lists alone
         counted["lengths"] = tuple(counted["lengths"])
-    method = method_by_name("pretrain" if command.verb == "pretrain" else command.method or "rlft")
-    num_updates = method.settings(**counted).num_updates(len(dataset))
+    num_updates = method_by_name(command.trainer).settings(**counted).num_updates(len(dataset))
     used = min(micro_batch, batch_size)
     return TrainingForecast(num_updates, run.seconds, num_measured, processes, used, peak, fitting, available)
 

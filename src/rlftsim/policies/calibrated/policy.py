@@ -155,7 +155,9 @@ class CalibratedPolicy(nn.Module):
         calibration: Mapping[str, Any] | None = None,
     ):
         if not (isinstance(base, nn.Module) and isinstance(base, TokenPolicy)):
-            raise ConfigError(f"a {type(base).__name__} cannot be calibrated: it has no weights or no vocabulary.")
+            raise ConfigError(
+                f"a {type(base).__name__} cannot be calibrated: it has no weights or no vocabulary; fine-tune by rlft."
+            )
         super().__init__()
         self.base: Any = base
         self.features = tuple(features)
