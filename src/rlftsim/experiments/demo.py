@@ -91,7 +91,7 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         policy = recipe.new_policy(vocabulary)
         base = pretrain_policy(policy, training, recipe.pretrain, out / "pretrain")
     with stage("fine-tuning: closed loop, MLOO reward, calibration at unchanged speed"):
-        settings = recipe.calibrate if recipe.method == "calibrate" else recipe.finetune
+        settings = (recipe.calibrate if recipe.method == "calibrate" else None) or recipe.finetune
         tuned = finetune_model(base, training, settings, out / "finetune")
     with stage(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
         # Both models from their folders, as `rlftsim evaluate` would load them.
