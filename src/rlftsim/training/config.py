@@ -119,8 +119,10 @@ class DeviceConfig:
 class ValidationConfig:
     """Validation of a model in training."""
 
-    every: int = 0
-    """Updates between two validations; there is one at the end, too. 0 = never."""
+    every: int | Literal["auto"] = 0
+    """Updates between two validations; there is one at the end, too. 0 = never. auto = so that all of a run take at
+    most 5 % of its time, at the start, at the end and up to 19 times between, on at most `num_scenarios`; a run that
+    is too short for 8 scenarios has none. A run stores the numbers in its config.json and is resumed with them."""
     num_scenarios: int = 64
     """A fixed random choice of the held-out scenarios; all if there are fewer."""
     num_rollouts: int = 8
@@ -131,6 +133,8 @@ class ValidationConfig:
     """Sample among so many of the most likely decisions, as models trained with label smoothing need it; None = all."""
     metric: str = "2025"
     """Configuration of the meta-metric."""
+    map_use: bool = True
+    """Measure map use, too, which takes as long as two rollouts."""
     seed: int = 0
     """Of the choice and of the rollouts, the same at every validation."""
     keep_best: bool = False
@@ -140,20 +144,37 @@ class ValidationConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        if self.every < 0:
-            raise ConfigError(f"validation.every must be 0 (never) or more updates, got {self.every}.")
+        if self.every != "auto" and self.every < 0:
+            raise ConfigError(f"validation.every must be 0 (never) or more updates, or auto, got {self.every}.")
         check_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass", *given(self, ("top_k",))))
         check_not_negative(self, ("seed",))
         check_metric(self.metric)
 
     def is_due(self, update: int, total: int) -> bool:
-        """True where a validation follows an update.
+        """True where a validation follows an update; `every` is a number.
 
         Args:
             update: Number of updates done.
             total: Number of updates of the run.
         """
-        return self.every > 0 and (update % self.every == 0 or update == total)
+        return self.every != "auto" and self.every > 0 and (update % self.every == 0 or update == total)
+
+    def fit(self, num_updates: int, rollouts_per_update: int) -> "ValidationConfig":
+        """The settings, with numbers in place of "auto".
+
+        Args:
+            num_updates: Number of updates of the run.
+            rollouts_per_update: Rollouts that an update learns from; 1 for a scenario that is learned from its log.
+        """
+        if self.every != "auto":
+            return self
+        # a rollout costs less than 2/5 of one that is learned from, so 1/8 of all these is 5 % of the time
+        affordable = num_updates * rollouts_per_update // (8 * self.num_rollouts)  # scenarios, over all validations
+        num_scenarios = min(affordable // 3, self.num_scenarios)
+        if num_scenarios < min(8, self.num_scenarios):
+            return replace(self, every=0)
+        count = min(affordable // num_scenarios, 21)  # that of the start included
+        return replace(self, every=math.ceil(num_updates / (count - 1)), num_scenarios=num_scenarios)
 
     def choose(self, num_scenarios: int) -> list[int]:
         """Positions of the scenarios to validate on."""
@@ -304,7 +325,9 @@ class FinetuneConfig:
     """After so many skipped updates the run stops with its last good checkpoint."""
     goals: GoalConfig = field(default_factory=GoalConfig)
     alarms: AlarmConfig = field(default_factory=AlarmConfig)
-    validation: ValidationConfig = field(default_factory=partial(ValidationConfig, keep_best=True))
+    validation: ValidationConfig = field(
+        default_factory=partial(ValidationConfig, every="auto", num_rollouts=4, map_use=False, keep_best=True)
+    )
     checkpoint_every: int = 50
     """Updates."""
     seed: int = 0

@@ -83,16 +83,31 @@ def train_policy(
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
     out = Path(out)
     check_folder(out, "run")
-    begun_with = flatten(stored_settings(out)).get("device.processes")
+    begun_with = flatten(stored_settings(out))
     processes = count_processes(
-        settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
-    )
+        settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size,
+        begun_with.get("device.processes"),
+    )  # fmt: skip
     settings = replace(settings, device=replace(settings.device, processes=processes))
+    if method.validates and settings.validation.every == "auto":
+        num_updates = settings.num_updates(len(scenarios))
+        num_updates = min(num_updates, max_updates or num_updates) if held_out is not None else 0
+        settings = replace(settings, validation=_fit_validation(settings, num_updates, begun_with))
+        if held_out is not None and not settings.validation.every:
+            log.info("no validation: 5 % of so short a run is too little for one; validation.every has one anyway.")
     work = partial(
         _make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers
     )
     with linked_processes(work, settings.device) as fabric:
         return work(fabric)
+
+
+def _fit_validation(settings: Any, num_updates: int, begun_with: Mapping[str, Any]) -> Any:
+    """Settings of the validation with numbers in place of "auto": those of the run in the folder if it validates."""
+    if begun_with.get("validation.every"):
+        stored = {name: begun_with[f"validation.{name}"] for name in ("every", "num_scenarios")}
+        return replace(settings.validation, **stored)
+    return settings.validation.fit(num_updates, settings.batch_size * getattr(settings, "num_rollouts", 1))
 
 
 def _find_method(settings: Any, held_out: TrainingScenarios | None, max_updates: int | None) -> Method[Any]:

@@ -156,8 +156,10 @@ def pretrain(
     settings: Any = config or (PretrainConfig() if recipe is None else to_recipe(recipe).pretrain)
     settings = with_changes(settings, processes, seed)
     tokens = None if vocabulary is None else Vocabulary.load(Path(vocabulary))
-    every = settings.validation.every
-    validation = find_held_out(scenarios, validation_split, every) if held_out is None else to_scenarios(held_out)
+    if held_out is None:
+        held_out = find_held_out(scenarios, training, validation_split, settings.validation.every)
+    else:
+        held_out = to_scenarios(held_out)
     if start is None:
         assert recipe is not None
         fresh = to_recipe(recipe)
@@ -173,7 +175,7 @@ def pretrain(
             learner = like.train_further(learner, *replaced)
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
     limits: Any = {"max_updates": max_updates, "on_update": on_update, "tracker": tracker}
-    return train(learner, training, out, settings, device=device, held_out=validation, card=card, **limits)
+    return train(learner, training, out, settings, device=device, held_out=held_out, card=card, **limits)
 
 
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:
