@@ -106,3 +106,21 @@ def test_nothing_overlaps_or_is_cut_off(address, browser, barriers, width, heigh
         drawn = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("L"))
         assert drawn.std() > 4  # a map
     page.close()
+
+
+@pytest.mark.parametrize("width", [360, 900, 1280])
+def test_the_status_of_each_of_three_panels_is_whole_and_moves_no_picture(address, browser, width):
+    page = browser.new_page(viewport={"width": width, "height": 720}, reduced_motion="reduce")
+    page.goto(address.replace("panels=log,goals", "panels=log,goals,demo-base"))
+    frames = "() => [...document.querySelectorAll('.frame')].map((one) => [one.clientWidth, one.clientHeight])"
+    page.wait_for_function("() => globalThis.studio?.state.scene && document.querySelectorAll('.frame').length === 3")
+    empty = page.evaluate(frames)
+    page.wait_for_function(OVER.replace("Object.keys", "studio.state.variants.get('demo-base')?.score && Object.keys"))
+    page.evaluate("() => studio.timeline.seek(90)")
+    page.wait_for_timeout(300)
+    assert page.evaluate(frames) == empty
+    heads, texts = (page.locator(f".{name}").all() for name in ("panel-head", "panel-status"))
+    assert [text.inner_text().count(" · ") for text in texts] == [0, 2, 2]
+    sizes = "(one) => [one.scrollWidth - one.clientWidth, one.scrollHeight - one.clientHeight]"
+    assert [one.evaluate(sizes) for one in [*heads, *texts]] == [[0, 0]] * 6
+    page.close()

@@ -121,6 +121,8 @@ def test_by_default_rewards_are_validated_for_a_twentieth_of_the_run():
     # the demo's 40 updates of 32 rollouts, 8 rollouts of training for each of a validation
     assert astuple(auto.fit(40, 32))[:3] == (20, 13, 4)
     assert 3 * 13 * 4 * 8 <= 40 * 32
+    # too few to choose a model by; the gain is logged all the same
+    assert (auto.fit(40, 32).keep_best, auto.fit(60_900, 32).keep_best, auto.fit(40, 32).paired) == (False, True, True)
     # of a long run 64 scenarios at most, 21 times: many more would find the luckiest
     assert astuple(auto.fit(60_900, 32))[:3] == (3045, 64, 4)
     # 8 scenarios, three times, are the least
@@ -139,6 +141,14 @@ def test_a_run_keeps_the_numbers_of_its_validations_where_it_goes_on(vocabulary,
     assert [(values["every"], values["num_scenarios"]) for values in stored] == [(2, 2), (0, 2)]
     lines = read_metrics(tmp_path / "grown")
     assert [line["update"] for line in lines if "validation_gain" in line] == [2, 4, 6, 8]
+
+
+def test_a_gain_may_be_logged_and_the_last_model_taken(vocabulary, drawn_scenarios, held_out, tmp_path, caplog):
+    validation = ValidationConfig(every=1, num_scenarios=3, num_rollouts=2, paired=True)
+    train_keeping_best(vocabulary, drawn_scenarios, held_out, tmp_path, validation=validation)
+    assert all("validation_gain_low" in line for line in read_metrics(tmp_path))
+    assert not (tmp_path / "best").exists()
+    assert "is the model of update" not in caplog.text
 
 
 def test_a_single_scenario_is_warned_of(vocabulary, drawn_scenarios, held_out, tmp_path, caplog):

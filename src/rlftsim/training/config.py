@@ -121,8 +121,9 @@ class ValidationConfig:
 
     every: int | Literal["auto"] = 0
     """Updates between two validations; there is one at the end, too. 0 = never. auto = so that all of a run take at
-    most 5 % of its time, at the start, at the end and up to 19 times between, on at most `num_scenarios`; a run that
-    is too short for 8 scenarios has none. A run stores the numbers in its config.json and is resumed with them."""
+    most 5 % of its time, at the start, at the end and up to 19 times between, on at most `num_scenarios`; the best is
+    kept only if on all these, and a run too short for 8 scenarios has none. A run stores the numbers in its
+    config.json and is resumed with them."""
     num_scenarios: int = 64
     """A fixed random choice of the held-out scenarios; all if there are fewer."""
     num_rollouts: int = 8
@@ -137,6 +138,8 @@ class ValidationConfig:
     """Measure map use, too, which takes as long as two rollouts."""
     seed: int = 0
     """Of the choice and of the rollouts, the same at every validation."""
+    paired: bool = False
+    """Validate the start, too, and log the gain over it; always so with `keep_best`."""
     keep_best: bool = False
     """The model of the run is that of the best validation: of the highest lower bound (95 %, one-sided) of its gain in
     RMM over the start, scenario by scenario. As the best of several bounds it promises too much: report the gain on
@@ -174,7 +177,10 @@ class ValidationConfig:
         if num_scenarios < min(8, self.num_scenarios):
             return replace(self, every=0)
         count = min(affordable // num_scenarios, 21)  # that of the start included
-        return replace(self, every=math.ceil(num_updates / (count - 1)), num_scenarios=num_scenarios)
+        # on few scenarios the highest lower bound is that of the model that differs least from the start
+        keep_best = self.keep_best and num_scenarios == self.num_scenarios
+        every = math.ceil(num_updates / (count - 1))
+        return replace(self, every=every, num_scenarios=num_scenarios, keep_best=keep_best)
 
     def choose(self, num_scenarios: int) -> list[int]:
         """Positions of the scenarios to validate on."""
@@ -326,7 +332,9 @@ class FinetuneConfig:
     goals: GoalConfig = field(default_factory=GoalConfig)
     alarms: AlarmConfig = field(default_factory=AlarmConfig)
     validation: ValidationConfig = field(
-        default_factory=partial(ValidationConfig, every="auto", num_rollouts=4, map_use=False, keep_best=True)
+        default_factory=partial(
+            ValidationConfig, every="auto", num_rollouts=4, map_use=False, paired=True, keep_best=True
+        )
     )
     checkpoint_every: int = 50
     """Updates."""

@@ -105,7 +105,7 @@ def train_policy(
 def _fit_validation(settings: Any, num_updates: int, begun_with: Mapping[str, Any]) -> Any:
     """Settings of the validation with numbers in place of "auto": those of the run in the folder if it validates."""
     if begun_with.get("validation.every"):
-        stored = {name: begun_with[f"validation.{name}"] for name in ("every", "num_scenarios")}
+        stored = {name: begun_with[f"validation.{name}"] for name in ("every", "num_scenarios", "keep_best")}
         return replace(settings.validation, **stored)
     return settings.validation.fit(num_updates, settings.batch_size * getattr(settings, "num_rollouts", 1))
 
@@ -161,7 +161,7 @@ def _make_updates(
         validator = None
         if held_out is not None:
             # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
-            start = learner.result if settings.validation.keep_best else None
+            start = learner.result if settings.validation.paired or settings.validation.keep_best else None
             validator = Validator(held_out, settings.validation, fabric, start)
         run.resume()
         with run.progress() as is_stopped:
@@ -171,7 +171,8 @@ def _make_updates(
                 ends = learner.update == run.num_updates or bool(report.stop_because)
                 if validator and (ends or validator.config.is_due(learner.update, run.num_updates)):
                     report.values.update(validator.validate(learner.result))
-                    note = f", RMM {report.values['validation_rmm']:.3f}"
+                    gain = f" ({gain:+.3f})" if (gain := report.values.get("validation_gain")) is not None else ""
+                    note = f", RMM {report.values['validation_rmm']:.3f}{gain}"
                     run.keep_best(report.values)
                 is_last = ends or is_stopped()
                 run.finish_update(replace(report, note=report.note + note), is_last=is_last)
@@ -316,7 +317,9 @@ class TrainingRun:
             self.folder.write_best(self.learner.update, self.learner.result)
 
     def _choose_best(self, values: Mapping[str, Any]) -> bool:
-        """Compare a validation with the best so far; True if it is better."""
+        """Compare a validation with the best so far; True if it is better and the best is kept."""
+        if not (hasattr(self.settings, "validation") and self.settings.validation.keep_best):
+            return False
         bound = values.get("validation_gain_low", math.nan)
         if math.isfinite(bound) and (self._best is None or bound > self._best[0]):
             self._best = bound, int(values["update"])
