@@ -94,7 +94,7 @@ def train_policy(
         num_updates = min(num_updates, max_updates or num_updates) if held_out is not None else 0
         settings = replace(settings, validation=_fit_validation(settings, num_updates, begun_with))
         if held_out is not None and not settings.validation.every:
-            log.info("no validation: 5 % of so short a run is too little for one; validation.every has one anyway.")
+            log.info("no validation: it would take more than 5 % of so short a run. Set validation.every to have one.")
     work = partial(
         _make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers
     )
@@ -318,7 +318,7 @@ class TrainingRun:
 
     def _choose_best(self, values: Mapping[str, Any]) -> bool:
         """Compare a validation with the best so far; True if it is better and the best is kept."""
-        if not (hasattr(self.settings, "validation") and self.settings.validation.keep_best):
+        if not getattr(getattr(self.settings, "validation", None), "keep_best", False):
             return False
         bound = values.get("validation_gain_low", math.nan)
         if math.isfinite(bound) and (self._best is None or bound > self._best[0]):
