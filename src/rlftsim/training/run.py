@@ -90,11 +90,9 @@ def train_policy(
     )  # fmt: skip
     settings = replace(settings, device=replace(settings.device, processes=processes))
     if method.validates and settings.validation.every == "auto":
-        num_updates = settings.num_updates(len(scenarios))
-        num_updates = min(num_updates, max_updates or num_updates) if held_out is not None else 0
+        num_updates = settings.num_updates(len(scenarios)) if held_out is not None else 0
+        num_updates = min(num_updates, max_updates or num_updates)
         settings = replace(settings, validation=_fit_validation(settings, num_updates, begun_with))
-        if held_out is not None and not settings.validation.every:
-            log.info("no validation: it would take more than 5 % of so short a run. Set validation.every to have one.")
     work = partial(
         _make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers
     )
@@ -107,7 +105,10 @@ def _fit_validation(settings: Any, num_updates: int, begun_with: Mapping[str, An
     if begun_with.get("validation.every"):
         stored = {name: begun_with[f"validation.{name}"] for name in ("every", "num_scenarios", "keep_best")}
         return replace(settings.validation, **stored)
-    return settings.validation.fit(num_updates, settings.batch_size * getattr(settings, "num_rollouts", 1))
+    fitted = settings.validation.fit(num_updates, settings.batch_size * getattr(settings, "num_rollouts", 1))
+    if num_updates and not fitted.every:
+        log.info("no validation: it would take more than 5 % of so short a run. Set validation.every to have one.")
+    return fitted
 
 
 def _find_method(settings: Any, held_out: TrainingScenarios | None, max_updates: int | None) -> Method[Any]:

@@ -112,8 +112,7 @@ def pretrain(
             A run repeated from its own config.json, with the same recipe, flags of the model, vocabulary and data,
             gives the same weights bit for bit. Flags override the file. In Python `PretrainConfig`, in place of the
             recipe's.
-        held_out: Scenarios for validation in closed loop, see `config.validation`; a name of a data set stands for its
-            split validation.
+        held_out: Scenarios for validation, see `config.validation`; a data set's name stands for its split validation.
         vocabulary: File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART. With
             --init-from its motion tokens take the places of the most similar ones of the model, which keeps its map
             pieces. In Python left out, one is built from the scenarios.
@@ -158,8 +157,7 @@ def pretrain(
     tokens = None if vocabulary is None else Vocabulary.load(Path(vocabulary))
     if held_out is None:
         held_out = find_held_out(scenarios, training, validation_split, settings.validation.every)
-    else:
-        held_out = to_scenarios(held_out)
+    held_out = None if held_out is None else to_scenarios(held_out)
     if start is None:
         assert recipe is not None
         fresh = to_recipe(recipe)
