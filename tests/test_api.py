@@ -173,6 +173,33 @@ def test_the_import_takes_a_tenth_of_a_second_and_no_torch():
     assert min(seconds) < 0.1
 
 
+@pytest.mark.parametrize(
+    ("verb", "arguments", "options", "message"),
+    [
+        ("simulate", ("a", "b"), {"temperature": 0.8}, r"write sampling=rs\.Sampling\(temperature=\.\.\.\)\."),
+        ("evaluate", ("a", "b"), {"top_k": 48}, r"no argument 'top_k': write sampling=rs\.Sampling\(top_k=\.\.\.\)\."),
+        ("finetune", ("a", "b"), {"top_k": 48}, r"set policy\.sampling = rs\.Sampling\(top_k=\.\.\.\) before\."),
+        (
+            "finetune",
+            ("a", "b"),
+            {"epochs": 2},
+            r"replace\(rs\.recipe\('smart-demo'\)\.finetune, epochs=\.\.\.\)",
+        ),
+        ("pretrain", ("a", "b"), {"learning_rate": 1}, r"replace\(rs\.recipe\('smart-demo'\)\.pretrain, learning_rate"),
+        ("simulate", ("a", "b"), {"num_rollout": 8}, r"no argument 'num_rollout': did you mean num_rollouts\?$"),
+        ("score", ("a",), {}, r"missing a required argument: 'rollouts': the arguments are scenarios, rollouts, "),
+        ("load_policy", ("a", "cpu", 3), {}, r"too many positional arguments: the arguments are name, device\.$"),
+    ],
+)
+def test_wrong_arguments_of_a_public_function_are_refused_with_what_works(verb, arguments, options, message):
+    with pytest.raises(ConfigError, match=rf"rs\.{verb}: .*{message}"):
+        getattr(rs, verb)(*arguments, **options)
+
+
+def test_public_functions_can_be_handed_to_other_processes():
+    assert pickle.loads(pickle.dumps(rs.evaluate)) is rs.evaluate
+
+
 # ---- ten things a newcomer types ----------------------------------------------------------------------------------
 
 

@@ -65,15 +65,20 @@ def area(first, second):
     return max(width, 0) * max(height, 0)
 
 
+def wait_for(page, condition):
+    """Wait for a minute at most until the page has a scene and a condition holds; its policy forbids to poll there."""
+    for _ in range(600):
+        if page.evaluate(f"() => Boolean(globalThis.studio?.state.scene && {condition})"):
+            break
+        page.wait_for_timeout(100)
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "height", "smallest"), [(1280, 720, 10), (3840, 2160, 16)])
 def test_nothing_overlaps_or_is_cut_off(address, browser, barriers, width, height, smallest, scheme):
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme, reduced_motion="reduce")
     page.goto(address)
-    for _ in range(600):
-        if page.evaluate(f"() => Boolean(globalThis.studio?.state.scene && {OVER})"):
-            break
-        page.wait_for_timeout(100)
+    wait_for(page, OVER)
     page.evaluate("() => studio.timeline.seek(40)")
     page.wait_for_timeout(500)  # thumbnails
     boxes = page.evaluate(BOXES)
@@ -105,4 +110,22 @@ def test_nothing_overlaps_or_is_cut_off(address, browser, barriers, width, heigh
     for canvas in page.locator(".panel canvas").all():
         drawn = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("L"))
         assert drawn.std() > 4  # a map
+    page.close()
+
+
+@pytest.mark.parametrize("width", [360, 900, 1280])
+def test_the_status_of_each_of_three_panels_is_whole_and_moves_no_picture(address, browser, width):
+    page = browser.new_page(viewport={"width": width, "height": 720}, reduced_motion="reduce")
+    page.goto(address.replace("panels=log,goals", "panels=log,goals,demo-base"))
+    frames = "() => [...document.querySelectorAll('.frame')].map((one) => [one.clientWidth, one.clientHeight])"
+    wait_for(page, "document.querySelectorAll('.frame').length === 3")
+    empty = page.evaluate(frames)
+    wait_for(page, OVER.replace("Object.keys", "studio.state.variants.get('demo-base')?.score && Object.keys"))
+    page.evaluate("() => studio.timeline.seek(90)")
+    page.wait_for_timeout(300)
+    assert page.evaluate(frames) == empty
+    heads, texts = (page.locator(f".{name}").all() for name in ("panel-head", "panel-status"))
+    assert [text.inner_text().count(" · ") for text in texts] == [0, 2, 2]
+    sizes = "(one) => [one.scrollWidth - one.clientWidth, one.scrollHeight - one.clientHeight]"
+    assert [one.evaluate(sizes) for one in [*heads, *texts]] == [[0, 0]] * 6
     page.close()

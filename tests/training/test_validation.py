@@ -1,8 +1,9 @@
 """Validation during training: the numbers of an evaluation, and not a trace in the weights."""
 
+import json
 import math
 import shutil
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.config import AlarmConfig, ValidationConfig
+from rlftsim.training.config import AlarmConfig, FinetuneConfig, ValidationConfig
 from rlftsim.training.monitoring import measure_map_use
 from rlftsim.training.run import TrainingRun
 from rlftsim.training.run_folder import read_metrics
@@ -112,6 +113,42 @@ def test_what_the_best_model_depends_on_cannot_change_when_a_run_goes_on(
     (tmp_path / "best" / "update-00000002.safetensors").unlink()
     with pytest.raises(CheckpointError, match=r"update-00000002\.safetensors is missing, the weights of the best"):
         train_keeping_best(*arguments, held_out, tmp_path, validation=replace(same, scenarios_per_pass=1))
+
+
+def test_by_default_rewards_are_validated_for_a_twentieth_of_the_run():
+    auto = FinetuneConfig().validation
+    assert auto.every == "auto"
+    # the demo's 40 updates of 32 rollouts, 8 rollouts of training for each of a validation
+    assert astuple(auto.fit(40, 32))[:3] == (20, 13, 4)
+    assert 3 * 13 * 4 * 8 <= 40 * 32
+    # too few to choose a model by; the gain is logged all the same
+    assert (auto.fit(40, 32).keep_best, auto.fit(60_900, 32).keep_best, auto.fit(40, 32).paired) == (False, True, True)
+    # of a long run 64 scenarios at most, 21 times: many more would find the luckiest
+    assert astuple(auto.fit(60_900, 32))[:3] == (3045, 64, 4)
+    # 8 scenarios, three times, are the least
+    assert [auto.fit(24, 32).every, auto.fit(23, 32).every, auto.fit(0, 32).every] == [12, 0, 0]
+    assert OFTEN.fit(1, 1) == OFTEN
+
+
+def test_a_run_keeps_the_numbers_of_its_validations_where_it_goes_on(vocabulary, drawn_scenarios, held_out, tmp_path):
+    auto = ValidationConfig(every="auto", num_scenarios=2, num_rollouts=1, keep_best=True)
+    options = {"validation": auto, "batch_size": 2, "num_rollouts": 6, "held_out": held_out}
+    for epochs, out in ((2.0, "grown"), (4.0, "grown"), (2.0, "blind")):
+        options |= {"held_out": None} if out == "blind" else {}
+        tiny.train("finetune", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / out, epochs=epochs, **options)
+    stored = [json.loads((tmp_path / out / "config.json").read_text())["validation"] for out in ("grown", "blind")]
+    # 4 updates of 12 rollouts pay 2 scenarios three times
+    assert [(values["every"], values["num_scenarios"]) for values in stored] == [(2, 2), (0, 2)]
+    lines = read_metrics(tmp_path / "grown")
+    assert [line["update"] for line in lines if "validation_gain" in line] == [2, 4, 6, 8]
+
+
+def test_a_gain_may_be_logged_and_the_last_model_taken(vocabulary, drawn_scenarios, held_out, tmp_path, caplog):
+    validation = ValidationConfig(every=1, num_scenarios=3, num_rollouts=2, paired=True)
+    train_keeping_best(vocabulary, drawn_scenarios, held_out, tmp_path, validation=validation)
+    assert all("validation_gain_low" in line for line in read_metrics(tmp_path))
+    assert not (tmp_path / "best").exists()
+    assert "is the model of update" not in caplog.text
 
 
 def test_a_single_scenario_is_warned_of(vocabulary, drawn_scenarios, held_out, tmp_path, caplog):

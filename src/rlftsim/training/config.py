@@ -119,8 +119,11 @@ class DeviceConfig:
 class ValidationConfig:
     """Validation of a model in training."""
 
-    every: int = 0
-    """Updates between two validations; there is one at the end, too. 0 = never."""
+    every: int | Literal["auto"] = 0
+    """Updates between two validations; there is one at the end, too. 0 = never. auto = so that all of a run take at
+    most 5 % of its time, at the start, at the end and up to 19 times between, on at most `num_scenarios`; the best is
+    kept only if on all these, and a run too short for 8 scenarios has none. A run stores the numbers in its
+    config.json and is resumed with them."""
     num_scenarios: int = 64
     """A fixed random choice of the held-out scenarios; all if there are fewer."""
     num_rollouts: int = 8
@@ -131,8 +134,12 @@ class ValidationConfig:
     """Sample among so many of the most likely decisions, as models trained with label smoothing need it; None = all."""
     metric: str = "2025"
     """Configuration of the meta-metric."""
+    map_use: bool = True
+    """Measure map use, too, which takes as long as two rollouts."""
     seed: int = 0
     """Of the choice and of the rollouts, the same at every validation."""
+    paired: bool = False
+    """Validate the start, too, and log the gain over it; always so with `keep_best`."""
     keep_best: bool = False
     """The model of the run is that of the best validation: of the highest lower bound (95 %, one-sided) of its gain in
     RMM over the start, scenario by scenario. As the best of several bounds it promises too much: report the gain on
@@ -140,20 +147,40 @@ class ValidationConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        if self.every < 0:
-            raise ConfigError(f"validation.every must be 0 (never) or more updates, got {self.every}.")
+        if self.every != "auto" and self.every < 0:
+            raise ConfigError(f"validation.every must be 0 (never) or more updates, or auto, got {self.every}.")
         check_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass", *given(self, ("top_k",))))
         check_not_negative(self, ("seed",))
         check_metric(self.metric)
 
     def is_due(self, update: int, total: int) -> bool:
-        """True where a validation follows an update.
+        """True where a validation follows an update; `every` is a number.
 
         Args:
             update: Number of updates done.
             total: Number of updates of the run.
         """
-        return self.every > 0 and (update % self.every == 0 or update == total)
+        return self.every != "auto" and self.every > 0 and (update % self.every == 0 or update == total)
+
+    def fit(self, num_updates: int, rollouts_per_update: int) -> "ValidationConfig":
+        """The settings, with numbers in place of "auto".
+
+        Args:
+            num_updates: Number of updates of the run.
+            rollouts_per_update: Rollouts that an update learns from; 1 for a scenario that is learned from its log.
+        """
+        if self.every != "auto":
+            return self
+        # a rollout costs less than 2/5 of one that is learned from, so 1/8 of all these is 5 % of the time
+        affordable = num_updates * rollouts_per_update // (8 * self.num_rollouts)  # scenarios, over all validations
+        num_scenarios = min(affordable // 3, self.num_scenarios)
+        if num_scenarios < min(8, self.num_scenarios):
+            return replace(self, every=0)
+        count = min(affordable // num_scenarios, 21)  # that of the start included
+        # on few scenarios the highest lower bound is that of the model that differs least from the start
+        keep_best = self.keep_best and num_scenarios == self.num_scenarios
+        every = math.ceil(num_updates / (count - 1))
+        return replace(self, every=every, num_scenarios=num_scenarios, keep_best=keep_best)
 
     def choose(self, num_scenarios: int) -> list[int]:
         """Positions of the scenarios to validate on."""
@@ -304,7 +331,11 @@ class FinetuneConfig:
     """After so many skipped updates the run stops with its last good checkpoint."""
     goals: GoalConfig = field(default_factory=GoalConfig)
     alarms: AlarmConfig = field(default_factory=AlarmConfig)
-    validation: ValidationConfig = field(default_factory=partial(ValidationConfig, keep_best=True))
+    validation: ValidationConfig = field(
+        default_factory=partial(
+            ValidationConfig, every="auto", num_rollouts=4, map_use=False, paired=True, keep_best=True
+        )
+    )
     checkpoint_every: int = 50
     """Updates."""
     seed: int = 0

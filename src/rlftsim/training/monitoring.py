@@ -231,8 +231,8 @@ def validate(
         fabric: Processes of the run, over which sums are added.
 
     Returns:
-        1. Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
-           predicts tokens the loss and map use on vehicles (`MapUse`), and the seconds taken.
+        1. Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), where asked for
+           and tokens are predicted the loss and map use on vehicles (`MapUse`), and the seconds taken.
         2. Meta-metric of each selected scenario; NaN where undefined.
 
     Raises:
@@ -249,7 +249,7 @@ def validate(
     rmm = torch.zeros(len(choice), dtype=torch.float64, device=fabric.device)
     positions = torch.arange(len(choice), device=fabric.device)[fabric.global_rank :: fabric.world_size]
     sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
-    map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
+    map_use = MapUse.zero(fabric.device) if config.map_use and predicts_tokens(frozen) else None
     for first in range(0, len(selected), config.scenarios_per_pass):
         batch = batch_with_futures(scenarios, selected[first : first + config.scenarios_per_pass]).to(fabric.device)
         with fabric.autocast():

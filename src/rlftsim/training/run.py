@@ -83,16 +83,32 @@ def train_policy(
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
     out = Path(out)
     check_folder(out, "run")
-    begun_with = flatten(stored_settings(out)).get("device.processes")
+    begun_with = flatten(stored_settings(out))
     processes = count_processes(
-        settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size, begun_with
-    )
+        settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size,
+        begun_with.get("device.processes"),
+    )  # fmt: skip
     settings = replace(settings, device=replace(settings.device, processes=processes))
+    if method.validates and settings.validation.every == "auto":
+        num_updates = settings.num_updates(len(scenarios)) if held_out is not None else 0
+        num_updates = min(num_updates, max_updates or num_updates)
+        settings = replace(settings, validation=_fit_validation(settings, num_updates, begun_with))
     work = partial(
         _make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers
     )
     with linked_processes(work, settings.device) as fabric:
         return work(fabric)
+
+
+def _fit_validation(settings: Any, num_updates: int, begun_with: Mapping[str, Any]) -> Any:
+    """Settings of the validation with numbers in place of "auto": those of the run in the folder if it validates."""
+    if begun_with.get("validation.every"):
+        stored = {name: begun_with[f"validation.{name}"] for name in ("every", "num_scenarios", "keep_best")}
+        return replace(settings.validation, **stored)
+    fitted = settings.validation.fit(num_updates, settings.batch_size * getattr(settings, "num_rollouts", 1))
+    if num_updates and not fitted.every:
+        log.info("no validation: it would take more than 5 % of so short a run. Set validation.every to have one.")
+    return fitted
 
 
 def _find_method(settings: Any, held_out: TrainingScenarios | None, max_updates: int | None) -> Method[Any]:
@@ -146,7 +162,7 @@ def _make_updates(
         validator = None
         if held_out is not None:
             # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
-            start = learner.result if settings.validation.keep_best else None
+            start = learner.result if settings.validation.paired or settings.validation.keep_best else None
             validator = Validator(held_out, settings.validation, fabric, start)
         run.resume()
         with run.progress() as is_stopped:
@@ -156,7 +172,8 @@ def _make_updates(
                 ends = learner.update == run.num_updates or bool(report.stop_because)
                 if validator and (ends or validator.config.is_due(learner.update, run.num_updates)):
                     report.values.update(validator.validate(learner.result))
-                    note = f", RMM {report.values['validation_rmm']:.3f}"
+                    gain = f" ({gain:+.3f})" if (gain := report.values.get("validation_gain")) is not None else ""
+                    note = f", RMM {report.values['validation_rmm']:.3f}{gain}"
                     run.keep_best(report.values)
                 is_last = ends or is_stopped()
                 run.finish_update(replace(report, note=report.note + note), is_last=is_last)
@@ -301,7 +318,9 @@ class TrainingRun:
             self.folder.write_best(self.learner.update, self.learner.result)
 
     def _choose_best(self, values: Mapping[str, Any]) -> bool:
-        """Compare a validation with the best so far; True if it is better."""
+        """Compare a validation with the best so far; True if it is better and the best is kept."""
+        if not getattr(getattr(self.settings, "validation", None), "keep_best", False):
+            return False
         bound = values.get("validation_gain_low", math.nan)
         if math.isfinite(bound) and (self._best is None or bound > self._best[0]):
             self._best = bound, int(values["update"])

@@ -197,7 +197,7 @@ def finetune(
     settings = with_changes(settings, processes, seed)
     trainer = find_method(settings)
     interval = settings.validation.every if trainer is not None and trainer.validates else 0
-    held_out = find_held_out(scenarios, validation_split, interval)
+    held_out = find_held_out(scenarios, training, validation_split, interval)
     learner, device = load_start(policy)
     conditioning = "" if goal is None else GoalConditioning(goal, goal_logit_bias)
     if conditioning:

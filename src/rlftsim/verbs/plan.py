@@ -112,7 +112,7 @@ def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: 
     num_items = max(round(WOMD_PIECES[plan] * total / WOMD_SCENARIOS[plan]), 1)
     agents = "" if math.isnan(cost.mean_agents) else f", {cost.mean_agents:.0f} agents on average"
     gigabytes = cost.peak_bytes / 1e9
-    memory = f"; the largest scenario takes {gigabytes:.1f} GB a core, {cores * gigabytes:.0f} GB a machine"
+    memory = f"; the largest scenario takes {gigabytes:.2f} GB a core, {cores * gigabytes:.1f} GB a machine"
     memory = memory if cost.peak_bytes else ""
     table = Table(
         *(Column(heading, justify="right") for heading in ("machines", "cores", "time", "price")),

@@ -112,8 +112,7 @@ def pretrain(
             A run repeated from its own config.json, with the same recipe, flags of the model, vocabulary and data,
             gives the same weights bit for bit. Flags override the file. In Python `PretrainConfig`, in place of the
             recipe's.
-        held_out: Scenarios for validation in closed loop, see `config.validation`; a name of a data set stands for its
-            split validation.
+        held_out: Scenarios for validation, see `config.validation`; a data set's name stands for its split validation.
         vocabulary: File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART. With
             --init-from its motion tokens take the places of the most similar ones of the model, which keeps its map
             pieces. In Python left out, one is built from the scenarios.
@@ -156,8 +155,9 @@ def pretrain(
     settings: Any = config or (PretrainConfig() if recipe is None else to_recipe(recipe).pretrain)
     settings = with_changes(settings, processes, seed)
     tokens = None if vocabulary is None else Vocabulary.load(Path(vocabulary))
-    every = settings.validation.every
-    validation = find_held_out(scenarios, validation_split, every) if held_out is None else to_scenarios(held_out)
+    if held_out is None:
+        held_out = find_held_out(scenarios, training, validation_split, settings.validation.every)
+    held_out = None if held_out is None else to_scenarios(held_out)
     if start is None:
         assert recipe is not None
         fresh = to_recipe(recipe)
@@ -173,7 +173,7 @@ def pretrain(
             learner = like.train_further(learner, *replaced)
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)
     limits: Any = {"max_updates": max_updates, "on_update": on_update, "tracker": tracker}
-    return train(learner, training, out, settings, device=device, held_out=validation, card=card, **limits)
+    return train(learner, training, out, settings, device=device, held_out=held_out, card=card, **limits)
 
 
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:

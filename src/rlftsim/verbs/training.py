@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from torch import nn
 
@@ -20,7 +20,7 @@ from rlftsim.recipes.card import append_cards, model_card
 from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import list_splits, open_dataset
-from rlftsim.scenario.types import Scenarios
+from rlftsim.scenario.types import Scenarios, list_scenario_ids
 from rlftsim.training.parallel import is_first_process
 from rlftsim.training.run import train_policy
 from rlftsim.training.trackers import find_tracker
@@ -126,14 +126,17 @@ def with_changes(settings: Any, processes: Any, seed: int | None) -> Any:
     return settings if seed is None else replace(settings, seed=whole_number("seed", seed, 0))
 
 
-def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset | None:
+def find_held_out(
+    data: Any, training: Scenarios, split: str | None, every: int | Literal["auto"]
+) -> ScenarioDataset | None:
     """Scenarios to validate on; None = no validation was requested, or the data set has no such split and none
     was named.
 
     Args:
         data: Training scenarios as they were handed over; only a data set has a split to validate on.
+        training: Training scenarios; where the split is not named, none of them is validated on.
         split: Split to validate on; None = "tune", where the data set has a split "validation".
-        every: Updates between two validations; 0 = none.
+        every: Updates between two validations, or "auto"; 0 = none.
 
     Raises:
         ConfigError: A split is named, but there is no validation.
@@ -143,7 +146,7 @@ def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset |
         raise ConfigError(f"--validation-split {split} has no effect: set validation.every to a number of updates.")
     if not every:
         return None
-    if isinstance(data, ScenarioDataset) and split is not None:
+    if isinstance(data, ScenarioDataset):
         data = data.folder
     if not isinstance(data, str | os.PathLike):
         if split is not None:
@@ -152,7 +155,11 @@ def find_held_out(data: Any, split: str | None, every: int) -> ScenarioDataset |
     if split is None and VALIDATION not in list_splits(data):
         log.info(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
         return None
-    return open_dataset(data, split or TUNE)
+    held_out = open_dataset(data, split or TUNE)
+    if split is None and not set(held_out.scenario_ids).isdisjoint(list_scenario_ids(training)):
+        log.info(f"no validation: the training scenarios are of the split {VALIDATION!r}, too.")
+        return None
+    return held_out
 
 
 @contextmanager

@@ -248,7 +248,7 @@ class Panel {
       if (this.key === "log" && state.log.steps <= step) parts.push("log ends here");
     }
     const text = parts.join(" · ");
-    if (text !== this.statusText) this.status.textContent = this.status.title = this.statusText = text;
+    if (text !== this.statusText) this.status.textContent = this.statusText = text;
     const empty = this.key !== "log" && !rollout;
     this.empty.hidden = !empty;
     if (empty) this.empty.textContent = variant?.reason ?? (state.isRunning ? "Simulating …" : "Press S to simulate.");
