@@ -59,8 +59,6 @@ def __getattr__(name: str) -> Any:
         hint = f": did you mean {near[0]!r}?" if near else ""
         raise AttributeError(f"module 'rlftsim' has no attribute {name!r}{hint}")
     value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    if callable(value) and not isinstance(value, type):
-        value = importlib.import_module("rlftsim.verbs.keywords").with_checked_arguments(value)
     if "IPython" in sys.modules:  # a notebook plays scenarios and rollouts that end a cell
         importlib.import_module("rlftsim.viewer.notebook")
     globals()[name] = value  # from now on found without this function

@@ -5,8 +5,10 @@ from rlftsim.rollout.check import check_policy as check_contract
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Model
 from rlftsim.verbs.inputs import to_policy
+from rlftsim.verbs.keywords import with_checked_arguments
 
 
+@with_checked_arguments
 def check_policy(policy: Model, scenarios: Data, *, reference: Model | None = None) -> CheckReport:
     """Try every rule of the policy contract that applies.
 

@@ -14,10 +14,12 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.open import open_dataset
 from rlftsim.verbs.arguments import Data
 from rlftsim.verbs.inputs import to_batch
+from rlftsim.verbs.keywords import with_checked_arguments
 
 NUM_ROLLOUTS = 3
 
 
+@with_checked_arguments
 def check_reward(reward: "Reward | str", scenarios: Data | None = None) -> CheckReport:
     """Try every rule of the reward contract that applies: shape, finite numbers, equal numbers for equal rollouts, no
     change of rollouts, no influence of padding, shares of agents that add up. Takes seconds.

@@ -16,8 +16,10 @@ from rlftsim.evaluation.results import Evaluation
 from rlftsim.jobs.progress import print_wide
 from rlftsim.verbs.arguments import Result, Results
 from rlftsim.verbs.inputs import read_result
+from rlftsim.verbs.keywords import with_checked_arguments
 
 
+@with_checked_arguments
 @overload
 def compare(a: Result, b: Result, *, alpha: float = ...) -> Comparison | DriveComparison: ...
 @overload

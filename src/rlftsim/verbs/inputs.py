@@ -19,11 +19,13 @@ from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import Name, open_dataset, to_scenarios
+from rlftsim.verbs.keywords import with_checked_arguments
 
 LOADED = "_loaded"
 """Attribute of a loaded policy: its name, and its fingerprint then."""
 
 
+@with_checked_arguments
 def load_dataset(name: Name, split: str | None = None) -> ScenarioDataset:
     """Open a converted data set, or the one that ships with the package.
 
@@ -40,6 +42,7 @@ def load_dataset(name: Name, split: str | None = None) -> ScenarioDataset:
     return open_dataset(validate_name(name, "data set", "synthetic"), split)
 
 
+@with_checked_arguments
 def load_policy(name: Name, device: Device = "auto") -> Policy:
     """Load a policy that is ready to simulate: no dropout, no gradients.
 

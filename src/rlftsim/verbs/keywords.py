@@ -18,10 +18,10 @@ SECTIONS = {"finetune": FinetuneConfig, "pretrain": PretrainConfig}
 
 
 def with_checked_arguments(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
-    """The function, which refuses wrong names and numbers of arguments by a ConfigError.
+    """Decorator of a function `rs.NAME`: wrong names and numbers of arguments are refused by a ConfigError.
 
     Args:
-        function: Function that users call as `rs.NAME`; a pickle names the result so, too.
+        function: Function that users call.
     """
     expected = signature(function)
 
@@ -36,7 +36,6 @@ def with_checked_arguments(function: Callable[Parameters, Returned]) -> Callable
             raise ConfigError(f"rs.{function.__name__}: {cause}: {way_out}") from None
         return function(*arguments, **options)
 
-    call.__module__ = "rlftsim"
     return call
 
 

@@ -15,6 +15,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.config import PretrainConfig
 from rlftsim.verbs.arguments import Data, File, Model, ModelOrRecipe, OnUpdate, Processes, Settings
 from rlftsim.verbs.inputs import check_config, to_recipe
+from rlftsim.verbs.keywords import with_checked_arguments
 from rlftsim.verbs.recipe_flags import RecipeFlags, find_value
 from rlftsim.verbs.runs import print_model, repeat_for_seeds
 from rlftsim.verbs.training import (
@@ -73,6 +74,7 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
         raise ConfigError(f"recipe {values['policy']} makes a model without a vocabulary: leave --vocabulary out.")
 
 
+@with_checked_arguments
 @repeat_for_seeds
 def pretrain(
     policy: ModelOrRecipe,

@@ -8,8 +8,10 @@ from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import recipe_as_json, recipe_as_text
 from rlftsim.verbs.arguments import Name
 from rlftsim.verbs.inputs import to_recipe
+from rlftsim.verbs.keywords import with_checked_arguments
 
 
+@with_checked_arguments
 def recipe(name: Name = "") -> Any:
     """Print every setting of a recipe with its documentation; without a name, list the recipes.
 

@@ -19,6 +19,7 @@ from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.verbs.arguments import Data, File, ScoreMetric, Simulated
 from rlftsim.verbs.inputs import check_left_out, to_batch
+from rlftsim.verbs.keywords import with_checked_arguments
 from rlftsim.viewer.notebook import check_rollouts
 
 IN_FILES = ("out", "name", "explain", "missing_map", "missing_scenario", "limit", "jobs", "work")
@@ -33,6 +34,7 @@ def score(
     explain: File | None = ..., missing_map: Literal["error", "skip"] = ...,
     missing_scenario: Literal["error", "skip"] = ..., limit: int | None = ..., jobs: int | None = ..., work: Work = ...,
 ) -> Evaluation: ...  # fmt: skip
+@with_checked_arguments
 def score(
     scenarios: Data,
     rollouts: Simulated,

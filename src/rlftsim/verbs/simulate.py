@@ -21,6 +21,7 @@ from rlftsim.scenario.open import open_dataset, to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goals import check_goal_effects, check_scenarios, read_given_goals
 from rlftsim.verbs.inputs import check_left_out, to_batch, to_policy, to_sampling
+from rlftsim.verbs.keywords import with_checked_arguments
 
 IN_FILES = ("scenario", "limit", "goal", "picture", "export", "jobs", "work")
 """Arguments without effect on rollouts in memory."""
@@ -39,6 +40,7 @@ def simulate(
     limit: int | None = ..., goal: tuple[str, ...] = ..., guidance_scale: float = ..., picture: bool = ...,
     export: tuple[str, ...] = ..., device: Device = ..., jobs: int = ..., work: Work = ...,
 ) -> list[Path]: ...  # fmt: skip
+@with_checked_arguments
 def simulate(
     policy: Model,
     scenarios: Data,
