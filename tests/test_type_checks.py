@@ -9,7 +9,7 @@ import torch
 
 import type_checks
 
-SOURCE = '''
+SOURCE = """
 from dataclasses import dataclass
 from typing import Literal
 
@@ -86,7 +86,7 @@ class Anything(metaclass=Seen):
 
 def look(value: Anything) -> float:
     return 1.0
-'''
+"""
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ import torch
 ARRAYS = (torch.Tensor, torch.nn.Parameter, np.ndarray)
 CONTAINERS = (tuple, list, dict, set, frozenset)
 CHECKED: dict[tuple, dict[tuple, set]] = defaultdict(dict)
-"""Right results by right arguments by function; by its name and its code, as inner functions are made again and again."""
+"""Right results by right arguments by function: its name and its code, as inner functions are made again and again."""
 IN_HAND = threading.local()
 check_each_call = jaxtyping.jaxtyped
 
