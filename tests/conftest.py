@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import type_checks
 from rlftsim.plugins import is_ours
 from rlftsim.verbs.plugins import POINTS
 
@@ -14,6 +15,8 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 """Of the system; None = the one of `playwright install chromium`."""
 BROWSER = os.environ.get("RLFTSIM_BROWSER", "chromium")
 """Or "firefox", of `playwright install firefox`."""
+
+type_checks.remember_checks()
 
 # pytest-xdist sets the width of its own terminal
 os.environ.pop("COLUMNS", None)

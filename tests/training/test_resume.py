@@ -205,20 +205,11 @@ def test_a_run_killed_at_a_random_moment_ends_as_if_it_never_was(stage, tmp_path
     assert [line["update"] for line in read_metrics(tmp_path / "killed")] == list(range(1, 9))
 
 
-def train_in_processes(stage, out, processes, *options, batch_size=4, launcher=()):
+def train_by_torchrun(stage, out, *options):
+    """An update with four scenarios, in two processes."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [
-        sys.executable,
-        *launcher,
-        tiny.__file__,
-        stage,
-        str(out),
-        "--updates",
-        "1",
-        "--batch-size",
-        str(batch_size),
-    ]
-    command += ["--processes", str(processes), *options]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", tiny.__file__]
+    command += [stage, str(out), "--updates", "1", "--batch-size", "4", *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr[-2000:]
 
@@ -242,11 +233,10 @@ def assert_same_gradients(first: Path, second: Path):
 @pytest.mark.parametrize("stage", ["pretrain", "catk"])
 def test_torchrun_finds_the_gradient_of_one_process(stage, tmp_path):
     costs = scenario_costs(tiny.pack_scenarios())
-    budget = str(2.1 * costs.min())  # some pieces hold two scenarios, some one
+    budget = float(2.1 * costs.min())  # some pieces hold two scenarios, some one
     assert costs.max() > 1.05 * costs.min()
-    train_in_processes(stage, tmp_path / "1", 1, "--micro-batch-cost", budget)
-    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    train_in_processes(stage, tmp_path / "2", 1, "--micro-batch-cost", budget, launcher=torchrun)
+    tiny.run(stage, tmp_path / "1", updates=1, batch_size=4, micro_batch_cost=budget)
+    train_by_torchrun(stage, tmp_path / "2", "--micro-batch-cost", str(budget))
     assert_same_gradients(tmp_path / "1", tmp_path / "2")
     assert (tmp_path / "2" / "model" / "model.safetensors").exists()
 

@@ -484,15 +484,16 @@ class Rules(_Subject):
         still = replace(self, scenarios=tuple(edge_scenes.place_on_grid(s) for s in self.scenarios))
         turns = {"shifted": 0.0, "turned by 90 degrees": math.pi / 2}
         turns["turned by 53.13 degrees"] = edge_scenes.EXACT_TURN_RAD
+        unmoved = [(r, self.log_prob(still.batch, r)) for r in (still.rollouts, still.with_forced, still.with_goals)]
         for name, turn in turns.items():
             moved = [edge_scenes.move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
             batch = self.collate(moved)
             # origins of map frames lie on whole meters, so no origin follows a scenario exactly
             origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
             offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(get_device(self.policy))  # [B, 2]
-            for rollouts in (still.rollouts, still.with_forced, still.with_goals):
+            for rollouts, expected in unmoved:
                 scored = self.log_prob(batch, _move_rollouts(rollouts, turn, offset))
-                gaps[name] = max(gaps.get(name, 0.0), compute_gap(scored, self.log_prob(still.batch, rollouts)))
+                gaps[name] = max(gaps.get(name, 0.0), compute_gap(scored, expected))
         return check_worst(gaps, SCORE_TOLERANCE + self.rounding, "largest gap")
 
     def rollouts_are_independent_of_batch_composition(self) -> str:

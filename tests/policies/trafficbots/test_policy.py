@@ -67,6 +67,28 @@ def test_all_eighty_decisions_are_scored_as_they_were_sampled(policy, batch):
     assert float((again - rollouts.log_prob).abs().max()) < 1e-4
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("changes", [False, True])
+def test_lights_are_encoded_at_each_decision_also_where_they_settle(policy, batch, monkeypatch, changes):
+    network, steps = policy.network, []
+    if changes:  # every ten steps, so that a window of eleven is never full of a single state
+
+        def change(features):
+            steps.append(1)
+            return torch.nn.functional.one_hot(torch.full(features.shape[:-1], len(steps) // 10 % 2), 5).float()
+
+        monkeypatch.setattr(network, "next_light_logits", change)
+    context = policy.encode(batch)
+    steps.clear()
+    scene = context.scene
+    neighborhoods = network.lights.neighborhoods(scene, context.map_features)
+    window = scene.light_state[:, None, :, : network.lights.window]
+    for step in range(80):
+        features = network.lights(window, neighborhoods)
+        assert torch.equal(context.light_features[:, step], features[:, 0])
+        window = torch.cat([window[..., 1:], network.next_light_logits(features).argmax(-1)[..., None]], -1)
+
+
 def test_mean_actions_differ_by_draws_alone(policy, batch):
     first, second = (
         simulate(policy, batch, num_rollouts=2, seed=0, sampling=Sampling(temperature=0.0)) for _ in range(2)

@@ -226,10 +226,13 @@ class TrafficBotsPolicy(nn.Module):
         if not scene.light_mask.any():
             return encoder(window, neighborhoods).expand(-1, FUTURE_STEPS, -1, -1)
         features = []
-        for _ in range(FUTURE_STEPS):
+        for step in range(1, FUTURE_STEPS + 1):
             features.append(encoder(window, neighborhoods))
             state = self.network.next_light_logits(features[-1]).argmax(-1)
-            window = torch.cat([window[..., 1:], state[..., None]], -1)
+            last, window = window, torch.cat([window[..., 1:], state[..., None]], -1)
+            if torch.equal(window, last) and not encoder.training:  # lights have settled: no feature changes any more
+                features.append(features[-1].expand(-1, FUTURE_STEPS - step, -1, -1))
+                break
         return torch.cat(features, 1)
 
     # ---- training -----------------------------------------------------------------------------------------------
