@@ -56,7 +56,7 @@ def assign_drivers(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
         if name == "idm":
             drivers[is_matched & (scene.object_type != ObjectType.VEHICLE)] = Driver.POLICY
     drivers[drivers < 0] = Driver.POLICY
-    if Driver.SUMO in drivers:
+    if "sumo" in rules.values():
         others = np.delete(drivers, scene.ego)
         if drivers[scene.ego] != Driver.PLANNER or (others != Driver.SUMO).any():
             raise ConfigError(
