@@ -57,8 +57,8 @@ def assign_drivers(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
             drivers[is_matched & (scene.object_type != ObjectType.VEHICLE)] = Driver.POLICY
     drivers[drivers < 0] = Driver.POLICY
     if "sumo" in rules.values():
-        others = np.delete(drivers, scene.ego)
-        if drivers[scene.ego] != Driver.PLANNER or (others != Driver.SUMO).any():
+        sumo_drivers = np.delete(drivers, scene.ego)
+        if drivers[scene.ego] != Driver.PLANNER or (sumo_drivers != Driver.SUMO).any():
             raise ConfigError(
                 "SUMO drives all agents but the ego, which the planner drives: leave out other drivers, or take other "
                 "traffic."

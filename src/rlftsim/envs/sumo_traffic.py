@@ -24,9 +24,10 @@ from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.scenario.synthetic.causal import BodyState, SumoPose, advance_body
 from rlftsim.scenario.synthetic.crop import on_grid
 from rlftsim.scenario.synthetic.windows import HEADING_GRID_PER_RAD, POSITION_GRID_PER_M, VELOCITY_GRID_PER_MPS
-from rlftsim.scenario.synthetic.worlds import AGAIN, WindowSource, find_window
+from rlftsim.scenario.synthetic.worlds import REMEDY, WindowSource, find_window
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
 
+WORKER = "rlftsim.scenario.synthetic.rerun"
 MAX_WORLDS = 16
 """Networks that run at the same time in a process of this package, about 100 MB each."""
 MAX_EPISODES = 64
@@ -97,7 +98,7 @@ def build_sumo_scene(scene: Scene, data: Path) -> SumoScene:
     row_of_id = {object_id: row for row, object_id in enumerate(scene.object_id.tolist())}
     lane_ids = np.unique(scene.scenario.lights.lane_id).tolist()
     if not {track.object_id for track in window.tracks} <= {*row_of_id} or not {*lane_ids} <= {*window.light_lanes}:
-        raise DataError(f"{window.path}: not of this scenario {scene.scenario.scenario_id}: {AGAIN}.")
+        raise DataError(f"{window.path}: not of this scenario {scene.scenario.scenario_id}: {REMEDY}.")
     lights = np.array([window.light_lanes.index(lane_id) for lane_id in lane_ids], np.int64)
     return SumoScene(window, tuple(row_of_id[track.object_id] for track in window.tracks), lights)
 
@@ -131,12 +132,12 @@ def advance_sumo(
     motion = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], 1)
     bodies, last_step = list(state.bodies), state.last_step.copy()
     rows = []
-    for index, (track, shown) in enumerate(zip(sumo_scene.window.tracks, answer["poses"], strict=True)):
+    for index, (track, track_pose) in enumerate(zip(sumo_scene.window.tracks, answer["poses"], strict=True)):
         row = sumo_scene.rows[index]
-        if shown is None:
+        if track_pose is None:
             last_step[row] = min(last_step[row], step - 1)
             continue
-        bodies[index], box = advance_body(track.shape, bodies[index], tuple(shown))
+        bodies[index], box = advance_body(track.shape, bodies[index], tuple(track_pose))
         rows.append((row, *box))
     if rows:
         agents, boxes = np.array([row[0] for row in rows]), np.array([row[1:] for row in rows])
@@ -185,7 +186,7 @@ class SumoWorld:
                 return self._step(window, poses)
             except (OSError, EOFError):
                 reason = self.close()
-        raise RlftsimError(f"SUMO has failed twice in {self.path} ({reason}): free memory, or {AGAIN}.")
+        raise RlftsimError(f"SUMO has failed twice in {self.path} ({reason}): free memory, or {REMEDY}.")
 
     def _step(self, window: int, poses: Poses) -> dict[str, Any]:
         channel, new_poses = self.channels.pop((window, poses[:-1]), None), poses[-1:]
@@ -206,17 +207,23 @@ class SumoWorld:
     def _open(self, window: int) -> socket.socket:
         """Socket of a new episode, in which SUMO stands at the current step of a window."""
         if self.process is None:
-            self.control, far = socket.socketpair()
-            command = [sys.executable, "-m", "rlftsim.scenario.synthetic.rerun", str(self.path), str(far.fileno())]
+            self.control, control_end = socket.socketpair()
+            command = [
+                sys.executable,
+                "-m",
+                "rlftsim.scenario.synthetic.rerun",
+                str(self.path),
+                str(control_end.fileno()),
+            ]
             self.process = subprocess.Popen(
-                command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                command, pass_fds=[control_end.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
             )  # fmt: skip
-            far.close()
+            control_end.close()
         assert self.control is not None
-        channel, far = socket.socketpair()
-        with far:
-            socket.send_fds(self.control, [str(window).encode()], [far.fileno()])
+        channel, channel_end = socket.socketpair()
+        with channel_end:
+            socket.send_fds(self.control, [str(window).encode()], [channel_end.fileno()])
         return channel
 
     def close(self) -> str:

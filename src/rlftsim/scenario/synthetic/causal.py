@@ -90,8 +90,8 @@ def advance_body(shape: BodyShape, state: BodyState, pose: SumoPose) -> tuple[Bo
 
 def _put_behind(shape: BodyShape, x: float, y: float, dx: float, dy: float) -> BodyState:
     """State of a body whose front is at x, y and which points along dx, dy."""
-    reach, ahead = shape.reach_m, shape.ahead_m
-    return BodyState(x, y, x - reach * dx, y - reach * dy, x - ahead * dx, y - ahead * dy)
+    reach_m, ahead_m, *_ = shape
+    return BodyState(x, y, x - reach_m * dx, y - reach_m * dy, x - ahead_m * dx, y - ahead_m * dy)
 
 
 def _move_left(shape: BodyShape, pose: SumoPose) -> tuple[float, float]:

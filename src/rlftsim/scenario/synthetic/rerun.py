@@ -1,4 +1,4 @@
-"""SUMO in a process of its own, forked at the current step of every window and again for every episode.
+"""SUMO in a separate process, forked at the current step of every window and again for every episode.
 
 Started by `python -m rlftsim.scenario.synthetic.rerun WORLD SOCKET`; imports libsumo, and nothing else of this package.
 SUMO stores no state exactly: a copied process is the only copy of a state that goes on bit for bit. The processes:
@@ -57,15 +57,15 @@ def serve_world(control: socket.socket, windows: list[dict[str, Any]]) -> None:
             while steps < window["num_steps"]:
                 libsumo.simulationStep()
                 steps += 1
-            near, far = socket.socketpair()
+            window_control, window_end = socket.socketpair()
             if os.fork() == 0:
-                for other in (control, near, *forked):
-                    other.close()
+                for parent_socket in (control, window_control, *forked):
+                    parent_socket.close()
                 os.close(descriptors[0])
-                serve_window(far, window)
+                serve_window(window_end, window)
                 os._exit(0)
-            far.close()
-            forked.append(near)
+            window_end.close()
+            forked.append(window_control)
         socket.send_fds(forked[int(message)], [b"."], descriptors)
         os.close(descriptors[0])
 
@@ -118,9 +118,9 @@ class Episode:
         if pose is not None and self.ego in libsumo.vehicle.getIDList():
             self.put_ego(pose)
         libsumo.simulationStep()
-        is_there = self.ego in libsumo.vehicle.getIDList()
-        self.off_lane_steps += not is_there or libsumo.vehicle.getLaneID(self.ego) == ""
-        if is_there:
+        is_present = self.ego in libsumo.vehicle.getIDList()
+        self.off_lane_steps += not is_present or libsumo.vehicle.getLaneID(self.ego) == ""
+        if is_present:
             x, y = libsumo.vehicle.getPosition(self.ego)
             for users in (libsumo.vehicle, libsumo.person):
                 for name in set(users.getIDList()).difference(self.tracks, [self.ego], self.strangers):
@@ -128,28 +128,28 @@ class Episode:
                         self.strangers.add(name)
 
     def put_ego(self, pose: list[float]) -> None:
-        """Ask SUMO to put the ego at a pose at the end of the step."""
+        """Ask SUMO to put the ego at a pose [x, y, angle] at the end of the step."""
         x, y, angle = pose
         vehicle = libsumo.vehicle
         if not self.is_driven:
             self.is_driven = True
             vehicle.setSpeedMode(self.ego, 0)
             vehicle.setLaneChangeMode(self.ego, 0)
-        edge, along, lane = libsumo.simulation.convertRoad(x, y, False, vehicle.getVehicleClass(self.ego))
+        edge, position_m, lane = libsumo.simulation.convertRoad(x, y, False, vehicle.getVehicleClass(self.ego))
         # moved to the next lane first: else a shadow, which stops its followers, stays on the old lane for ever
         if edge == vehicle.getRoadID(self.ego) and edge[:1] != ":" and lane != vehicle.getLaneIndex(self.ego):
-            vehicle.moveTo(self.ego, f"{edge}_{lane}", along)
+            vehicle.moveTo(self.ego, f"{edge}_{lane}", position_m)
         vehicle.moveToXY(self.ego, "", -1, x, y, angle=angle, keepRoute=2)
 
     def describe(self) -> dict[str, Any]:
         """What SUMO shows: poses of the tracks (None = gone), letters of the lights, and counts since the start."""
-        shown = {}
+        poses = {}
         for users in (libsumo.vehicle, libsumo.person):
             for name in set(users.getIDList()).intersection(self.tracks):
-                shown[name] = [round(value, DIGITS) for value in (*users.getPosition(name), users.getAngle(name))]
+                poses[name] = [round(value, DIGITS) for value in (*users.getPosition(name), users.getAngle(name))]
         states = {junction: libsumo.trafficlight.getRedYellowGreenState(junction) for junction, _, _ in self.lights}
         return {
-            "poses": [shown.get(name) for name in self.tracks],
+            "poses": [poses.get(name) for name in self.tracks],
             "lights": "".join(states[junction][link] for junction, link, _ in self.lights),
             "off_lane_steps": self.off_lane_steps,
             "num_strangers": len(self.strangers),

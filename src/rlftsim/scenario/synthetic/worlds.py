@@ -24,7 +24,7 @@ WORLDS, SUFFIX = "worlds", ".world"
 NETWORK, ROUTES, DOCUMENT = "network.net.xml", "demand.rou.xml", "world.json"
 """Members of an archive, which `rerun` reads, too."""
 FORMAT = "rlftsim-world-1"
-AGAIN = "make the data set again with rlftsim synthesize --keep-worlds"
+REMEDY = "make the data set again with rlftsim synthesize --keep-worlds"
 
 
 @dataclass(frozen=True)
@@ -86,20 +86,20 @@ def write_world(folder: Path, world: World, windows: Sequence[Window]) -> None:
 
 def _describe_window(window: Window, links: dict[int, tuple[str, int]]) -> dict[str, object]:
     """What a window has in an archive."""
-    scenario, now = window.scenario, window.start + CURRENT_STEP
+    scenario, current_step = window.scenario, window.start + CURRENT_STEP
     ego, is_valid = window.bodies[scenario.ego_index].dragging, scenario.tracks.valid[:, CURRENT_STEP]
     assert ego is not None, "the ego is a moving vehicle"
     tracks = [
         {
             "object_id": int(object_id), "sumo_id": body.dragging.sumo_id, "shape": body.dragging.shape,
-            "state": body.dragging.states[now - body.first_step],
+            "state": body.dragging.states[current_step - body.first_step],
         }
         for object_id, body, is_track in zip(scenario.tracks.object_id, window.bodies, is_valid)
         if is_track and body.dragging is not None and body.dragging is not ego
     ]  # fmt: skip
     lights = [[*links[lane_id], lane_id] for lane_id in sorted(set(scenario.lights.lane_id.tolist()))]
     # the row that SUMO writes for a time is what its interface shows one step later
-    num_steps = round(DISCARDED_S / STEP_S) + now + 1
+    num_steps = round(DISCARDED_S / STEP_S) + current_step + 1
     return {
         "scenario_id": scenario.scenario_id, "num_steps": num_steps, "ego": ego.sumo_id, "tracks": tracks,
         "lights": lights,
@@ -119,7 +119,7 @@ def find_window(folder: Path, scenario_id: str) -> WindowSource:
     worlds = folder / WORLDS
     windows = _read_folder(worlds, worlds.stat().st_mtime_ns) if worlds.is_dir() else {}
     if scenario_id not in windows:
-        raise DataError(f"scenario {scenario_id}: {worlds} has no world that SUMO can run again: {AGAIN}.")
+        raise DataError(f"scenario {scenario_id}: {worlds} has no world that SUMO can run again: {REMEDY}.")
     return windows[scenario_id]
 
 
@@ -141,10 +141,10 @@ def _read_world(path: Path) -> dict[str, WindowSource]:
                 raise ValueError(f"{DOCUMENT} is larger than {MAX_TEXT_BYTES >> 20} MiB")
             text = archive.read(DOCUMENT)
     except (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, ZlibError) as problem:
-        raise DataError(f"{path}: no archive of a world ({first_line(problem)}): {AGAIN}.") from None
-    document = parse_json(text, AGAIN, source=f"{path}: {DOCUMENT}")
+        raise DataError(f"{path}: no archive of a world ({first_line(problem)}): {REMEDY}.") from None
+    document = parse_json(text, REMEDY, source=f"{path}: {DOCUMENT}")
     if document.get("format") != FORMAT or document.get("options") != list(OPTIONS):
-        raise DataError(f"{path}: of another version of rlftsim: {AGAIN}.")
+        raise DataError(f"{path}: of another version of rlftsim: {REMEDY}.")
     try:
         steps = [int(window["num_steps"]) for window in document["windows"]]
         if steps != sorted(steps) or max(steps, default=0) > SIMULATED_S / STEP_S:
@@ -157,7 +157,7 @@ def _read_world(path: Path) -> dict[str, WindowSource]:
             for index, window in enumerate(document["windows"])
         }  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as problem:
-        raise DataError(f"{path}: a damaged world ({first_line(problem)}): {AGAIN}.") from None
+        raise DataError(f"{path}: a damaged world ({first_line(problem)}): {REMEDY}.") from None
 
 
 def _parse_track(track: dict[str, object]) -> TrackSource:
