@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -41,7 +42,7 @@ from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk, writ
 from rlftsim.policies.smart.config import smart_nano
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.recipes.settings import recipe_as_json
-from rlftsim.scenario.synthetic import generate
+from rlftsim.scenario.synthetic import generate, worlds
 from rlftsim.scenario.tfrecord import write_records
 from rlftsim.scenario.transfer import pull_dataset
 from rlftsim.studio.serving import load_token
@@ -194,6 +195,29 @@ def read_begun_synthesis(folder: Path) -> None:
 def make_begun_synthesis(folder: Path) -> None:
     with without_sumo(), contextlib.suppress(RlftsimError):
         run("synthesize", folder / "new", "--num-scenarios", 4, "--share", "1/2")
+
+
+def make_world_document(folder: Path) -> None:
+    track = {"object_id": 7, "sumo_id": "v7", "shape": (3.6, 2.3, 0.1, 1.0), "state": (9.0, 1.0, 5.4, 1.0, 6.7, 1.0)}
+    window = {"scenario_id": "a", "num_steps": 631, "ego": "v1", "tracks": [track], "lights": [["J1", 0, 12]]}
+    document = {"format": worlds.FORMAT, "sumo_version": "1.28.0", "seed": 5, "options": worlds.OPTIONS}
+    (folder / worlds.DOCUMENT).write_text(json.dumps({**document, "windows": [window]}))
+
+
+def pack_world(folder: Path) -> None:
+    (folder / worlds.WORLDS).mkdir()
+    with zipfile.ZipFile(folder / worlds.WORLDS / f"a{worlds.SUFFIX}", "w") as archive:
+        archive.write(folder / worlds.DOCUMENT, worlds.DOCUMENT)
+
+
+def make_world(folder: Path) -> None:
+    make_world_document(folder)
+    pack_world(folder)
+
+
+def read_world_document(folder: Path) -> None:
+    pack_world(folder)
+    worlds.find_window(folder, "a")
 
 
 def make_begun_copy(folder: Path) -> None:
@@ -551,6 +575,15 @@ FORMATS: Mapping[str, Format] = {
     ),
     "begun synthesis": Format(
         {"new/INCOMPLETE": "json"}, make_begun_synthesis, read_begun_synthesis, ("scenario.synthetic.generate",)
+    ),
+    "world": Format(
+        {"worlds/*": "archive"},
+        make_world,
+        lambda folder: worlds.find_window(folder, "a"),
+        ("scenario.synthetic.worlds",),
+    ),
+    "document of a world": Format(
+        {"world.json": "json"}, make_world_document, read_world_document, ("scenario.synthetic.worlds",)
     ),
     "begun copy": Format(
         {"new/INCOMPLETE": "text"},

@@ -30,7 +30,7 @@ class EnvConfig:
     model: str = "demo-base"
     """Traffic model: a run, a model folder or a registered name."""
     traffic: Traffic = "policy"
-    """Driver of all agents but the ego: policy, replay, constant_velocity or idm."""
+    """Driver of all agents but the ego: policy, replay, constant_velocity, idm or sumo."""
     drivers: Rules = field(default_factory=dict)
     """Drivers of some agents, the first match wins; see `assign_drivers`. They come before `traffic`."""
     action: ActionType = "bicycle"

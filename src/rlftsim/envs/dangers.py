@@ -10,7 +10,7 @@ weights 3 to 1, told failing episodes from others best, 1 and 2 s before the con
 other agents.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -21,6 +21,7 @@ from rlftsim.envs.contact import STOPPED_MPS, Collision
 from rlftsim.envs.episode import Episode, EpisodeState, off_road_m
 from rlftsim.envs.planner_scores import find_signals, passes_red_light
 from rlftsim.envs.road import OUTSIDE_M
+from rlftsim.envs.world import find_lights, find_presence
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.geometry import wrapped
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
@@ -100,7 +101,7 @@ class StepView:
         """Rows of the agents that are there, near and not yet touched."""
         scene, agent = self.index
         world, motion = self.episode.world, self.state.world.motion[scene]
-        counts = world.is_observed[scene, :, CURRENT_STEP + self.step] & ~self.state.touched[self.row]
+        counts = find_presence(world, self.state.world)[1][scene, :, -1] & ~self.state.touched[self.row]
         counts[agent] = False
         return np.flatnonzero(counts & (np.abs(motion[:, :2] - motion[agent, :2]).max(1) < reach_m))
 
@@ -203,12 +204,13 @@ class RedLight:
     def danger(self, view: StepView) -> float:
         """0 from the violation on; before, minus the seconds until the nearest stop point, less those to brake in."""
         scene, agent = view.index
-        scenario = view.episode.world.scenes[scene].scenario
-        if find_signals(scenario) is None:
+        world = view.episode.world
+        lights = find_lights(world, view.state.world)[scene]
+        if find_signals(world.scenes[scene].scenario) is None:
             return NEVER
-        if passes_red_light(scenario, np.stack([m[scene, agent, :2] for m in view.state.world.track[CURRENT_STEP:]])):
+        driven = np.stack([m[scene, agent, :2] for m in view.state.world.track[CURRENT_STEP:]])
+        if passes_red_light(replace(world.scenes[scene], lights=lights), driven):
             return 0.0
-        lights = view.episode.world.scenes[scene].lights
         ahead = lights.point - view.ego[:2]
         forward = ahead @ [np.cos(view.ego[2]), np.sin(view.ego[2])]
         distance = np.hypot(*ahead.T)[forward > 0]

@@ -24,9 +24,11 @@ class Driver(IntEnum):
     CONSTANT_VELOCITY = 3
     IDM = 4
     """The intelligent driver model along its logged path, for vehicles alone; other agents follow the policy."""
+    SUMO = 5
+    """The drivers who made a synthetic log, in the log's world run again; for all agents but the ego."""
 
 
-Traffic = Literal["policy", "replay", "constant_velocity", "idm"]
+Traffic = Literal["policy", "replay", "constant_velocity", "idm", "sumo"]
 """Drivers that a whole scene may have besides the planner."""
 TRAFFIC = get_args(Traffic)
 GROUPS = {"vehicles": ObjectType.VEHICLE, "pedestrians": ObjectType.PEDESTRIAN, "cyclists": ObjectType.CYCLIST}
@@ -43,7 +45,7 @@ def assign_drivers(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
         rules: Agents to driver, the first match wins; an agent that no rule names follows the policy.
 
     Raises:
-        ConfigError: No such group, agent or driver.
+        ConfigError: No such group, agent or driver, or SUMO for some agents but not for all but the ego.
     """
     drivers = np.full(len(scene.object_id), -1)
     for group, name in rules.items():
@@ -53,7 +55,15 @@ def assign_drivers(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
         drivers[is_matched] = Driver[name.upper()]
         if name == "idm":
             drivers[is_matched & (scene.object_type != ObjectType.VEHICLE)] = Driver.POLICY
-    return np.where(drivers < 0, Driver.POLICY, drivers)
+    drivers[drivers < 0] = Driver.POLICY
+    if "sumo" in rules.values():
+        sumo_drivers = np.delete(drivers, scene.ego)
+        if drivers[scene.ego] != Driver.PLANNER or (sumo_drivers != Driver.SUMO).any():
+            raise ConfigError(
+                "SUMO drives all agents but the ego, which the planner drives: leave out other drivers, or take other "
+                "traffic."
+            )
+    return drivers
 
 
 def _find_members(scene: Scene, group: str | int) -> Bool[np.ndarray, "A"]:

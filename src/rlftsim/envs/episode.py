@@ -18,7 +18,7 @@ from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
 from rlftsim.envs.route import SPACING_M, find_route
-from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
+from rlftsim.envs.world import Dice, World, WorldState, begin, find_presence, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.goals.types import PointById
 from rlftsim.realism.map_based import RoadEdges, compute_point_distance_to_road_edge, join_road_edges
@@ -334,7 +334,7 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     """Tracks that each planner-driven agent overlaps now."""
     scene, agent = episode.world.actors.T
     size = episode.world.size
-    is_touchable = episode.world.is_observed[scene, :, len(world.track) - 1]
+    is_touchable = find_presence(episode.world, world)[1][scene, :, -1]
     is_touchable[np.arange(len(scene)), agent] = False
     tracks = world.motion[scene]  # [M, A, 5]
     gap, agent_size = tracks[..., :2] - motion[:, None, :2], size[scene, agent][:, None]

@@ -16,7 +16,7 @@ from rlftsim.envs.drivers import Driver
 from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import Route, compute_headings
 from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW
-from rlftsim.envs.world import World, WorldState, padded
+from rlftsim.envs.world import World, WorldState, find_lights, find_presence, padded
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
 
@@ -104,9 +104,7 @@ class Atlas:
     crossings: Float[np.ndarray, "B c 8"]
     crossing_middle: Float[np.ndarray, "B c 2"]
     light_point: Float[np.ndarray, "B T1 2"]
-    light_state: Int64[np.ndarray, "B 91 T1"]
-    """The last light of each scene is none, with state 0."""
-    light_age: Float[np.ndarray, "B 91 T1"]
+    """The last light of each scene is none, far away."""
     last_logged: Int64[np.ndarray, "B A 91"]
     """Last step with a logged state, up to each step."""
     routes: tuple[Route, ...]
@@ -132,8 +130,6 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     num_lights = max(len(scene.lights.lane) for scene in scenes)
     lane_light = _stack([np.where(s.lanes.light < 0, num_lights, s.lanes.light) for s in scenes], num_lights)
     owner = _stack([scene.lanes.lane for scene in scenes], -1)
-    states = [np.pad(s.lights.state, ((0, 0), (0, num_lights + 1 - len(s.lights.lane)))) for s in scenes]
-    ages = [np.pad(s.lights.age_s, ((0, 0), (0, num_lights + 1 - len(s.lights.lane)))) for s in scenes]
     light_point = padded([s.lights.point for s in scenes], (len(scenes), num_lights + 1, 2), _FAR_M)
     facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
     edges, crossings = _stack([s.edges for s in scenes], _FAR_M), _stack([s.crossings for s in scenes], _FAR_M)
@@ -166,8 +162,6 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         crossings=crossings,
         crossing_middle=crossing_middle,
         light_point=light_point,
-        light_state=np.stack(states),
-        light_age=np.stack(ages),
         last_logged=np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2),
         routes=routes,
         route_points=route_points,
@@ -204,7 +198,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
 
     # 1. Motion over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
     past = np.stack(state.track[-HISTORY - 1 :], 1)[scene]
-    is_present = np.moveaxis(world.is_present[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
+    is_present = np.moveaxis(find_presence(world, state)[0][scene, :, log_step - HISTORY :], 2, 1)  # [M, 11, A]
     neighbor_distance = _distance(motion, past[:, -1])
     neighbor_distance[~is_present[:, -1]] = np.inf
     neighbor_distance[row, agent] = np.inf
@@ -224,7 +218,9 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     lane, has_lane = _nearest(distances["lanes"], LANES)
     edge, has_edge = _nearest(distances["edges"], EDGES)
     area, has_area = _nearest(distances["crossings"], CROSSINGS)
-    colors = atlas.light_state[scene, log_step]  # [M, T + 1]
+    lights, shape = find_lights(world, state), atlas.light_point.shape[:2]
+    colors = padded([scene_lights.state[log_step] for scene_lights in lights], shape, 0)[scene]  # [M, T + 1]
+    ages = padded([scene_lights.age_s[log_step] for scene_lights in lights], shape)[scene]
     light_distance = distances["lights"]
     light_distance[colors == 0] = np.inf
     light, has_light = _nearest(light_distance, LIGHTS)
@@ -266,8 +262,8 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         atlas.on_route[row[:, None], lane][..., None], lane_facts[..., 2:],
     ], -1)  # fmt: skip
     color = colors[row[:, None], light]
-    lamps = [color == RED, color == YELLOW, color == GREEN, atlas.light_age[scene[:, None], log_step, light]]
-    lights = np.concatenate([light_points, np.stack(lamps, -1)], -1)
+    lamps = [color == RED, color == YELLOW, color == GREEN, ages[row[:, None], light]]
+    lamp_rows = np.concatenate([light_points, np.stack(lamps, -1)], -1)
     route = np.concatenate([route_points, atlas.route_limit[row[:, None], index][..., None]], -1)
     goal = np.concatenate([end[:, 0], np.ones((count, 1))], -1)
     ego_direction = ego_motion[..., 2] - angle[:, None]
@@ -293,7 +289,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         edges_mask=_masks(has_edge, EDGES),
         crossings=_rows(crossings.reshape(count, -1, 8), has_area, CROSSINGS),
         crossings_mask=_masks(has_area, CROSSINGS),
-        lights=_rows(lights, has_light, LIGHTS),
+        lights=_rows(lamp_rows, has_light, LIGHTS),
         lights_mask=_masks(has_light, LIGHTS),
         route=_rows(route, on_route, ROUTE),
         route_mask=_masks(on_route, ROUTE),

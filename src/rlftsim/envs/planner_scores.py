@@ -17,6 +17,7 @@ from rlftsim.envs.contact import BEHIND_RAD, in_one_lane, lane_search
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.route import Route
+from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
@@ -101,7 +102,7 @@ def score_planner(record: Record) -> PlannerScores:
         collision_rate=float(bool(collisions)),
         at_fault_collision_rate=float(any(faults)),
         hit_rate=float(not all(faults)),
-        red_light_rate=float(passes_red_light(record.scene.scenario, record.agent_motion[:, :2])),
+        red_light_rate=float(passes_red_light(record.scene, record.agent_motion[:, :2])),
         least_ttc_s=least_time_to_collision(record),
         off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(off_road(record).max())),
         route_completion=_gained(record.route, record.agent_motion) / route_length_m if route_length_m else math.nan,
@@ -328,16 +329,20 @@ def find_signals(scenario: Scenario) -> Signals | None:
     return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
 
 
-def passes_red_light(scenario: Scenario, driven: Float[np.ndarray, "T1 2"]) -> bool:
+def passes_red_light(scene: Scene, driven: Float[np.ndarray, "T1 2"]) -> bool:
     """True for a way that passes the stop point of a red light on its lane.
 
     Args:
-        scenario: Scenario with the map and the lights; without lights nothing is passed.
+        scene: Scene with the map and the lights of the episode; without lights nothing is passed.
         driven: Positions [T + 1, 2] of the agent from the current step on, map frame, m.
     """
-    signals, num_steps = find_signals(scenario), len(driven) - 1
+    scenario, num_steps = scene.scenario, len(driven) - 1
+    signals = find_signals(scenario)
     if signals is None or not num_steps:
         return False
+    if scene.lights is not build_env_scene(scenario).lights:  # as SUMO showed them
+        signals = build_signals(scenario.map_features, scene.lights.log(scenario.lights), torch.device("cpu"))
+        assert signals is not None
     x, y = torch.from_numpy(driven + scenario.origin).float().T[:, None, None]
     valid = torch.ones(1, 1, num_steps, dtype=torch.bool)
     passed = compute_traffic_light_violation(x, y, valid, signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS)

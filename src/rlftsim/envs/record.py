@@ -9,6 +9,7 @@ from rlftsim.envs.contact import Collision
 from rlftsim.envs.episode import Episode, EpisodeState
 from rlftsim.envs.route import Route, find_route
 from rlftsim.envs.scene import Scene
+from rlftsim.envs.world import find_lights, find_presence
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 
@@ -17,6 +18,7 @@ class Record:
     """A scene from the current step on: T further steps of 0.1 s. Map frame."""
 
     scene: Scene
+    """With the lights of the episode, which differ from those of the log where SUMO drives the others."""
     agent: int
     """Row of the planner's agent."""
     motion: Float[np.ndarray, "A T1 5"]
@@ -85,14 +87,17 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
     """
     scene_row, agent = (int(index) for index in episode.world.actors[row])
     scene = episode.world.scenes[scene_row]
-    count, last = len(scene.object_id), len(state.world.track)
+    count = len(scene.object_id)
+    is_present, is_observed = (
+        array[scene_row, :count, CURRENT_STEP:] for array in find_presence(episode.world, state.world)
+    )
     return Record(
-        scene=scene,
+        scene=replace(scene, lights=find_lights(episode.world, state.world)[scene_row]),
         agent=agent,
         motion=np.stack([step[scene_row, :count] for step in state.world.track[CURRENT_STEP:]], 1),
         z=np.stack([z[scene_row, :count] for z in state.world.z[CURRENT_STEP:]], 1),
-        is_present=episode.world.is_present[scene_row, :count, CURRENT_STEP:last],
-        is_observed=episode.world.is_observed[scene_row, :count, CURRENT_STEP:last],
+        is_present=is_present,
+        is_observed=is_observed,
         collisions=state.collisions[row],
         route=episode.atlas.routes[row],
         logged_route=find_route(scene.scenario, agent, "logged"),

@@ -3,7 +3,7 @@
 Frame: map (centered on the scenario, meters), float64. Built once per scenario and cached with the scenario.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +18,7 @@ from rlftsim.scenario.types import (
     STEP_S,
     TOTAL_STEPS,
     LightState,
+    LightStates,
     MapFeatureType,
     Scenario,
     cached_on_scenario,
@@ -33,6 +34,7 @@ _COLOR_OF_STATE = np.zeros(9, np.int64)
 _COLOR_OF_STATE[[LightState.ARROW_STOP, LightState.STOP, LightState.FLASHING_STOP]] = RED
 _COLOR_OF_STATE[[LightState.ARROW_CAUTION, LightState.CAUTION, LightState.FLASHING_CAUTION]] = YELLOW
 _COLOR_OF_STATE[[LightState.ARROW_GO, LightState.GO]] = GREEN
+_STATE_OF_COLOR = np.array([LightState.UNKNOWN, LightState.STOP, LightState.CAUTION, LightState.GO], np.int8)
 AREA_TYPES = (MapFeatureType.CROSSWALK, MapFeatureType.SPEED_BUMP)
 
 
@@ -66,6 +68,11 @@ class Lights:
     """Time since the state last changed."""
     last_observed: int
     """Last step with an observation; -1 = there is none."""
+
+    def log(self, logged: LightStates) -> LightStates:
+        """Observations of the same lights at the same steps, with the states that are here."""
+        _, column = np.unique(logged.lane_id, return_inverse=True)
+        return replace(logged, state=_STATE_OF_COLOR[self.state[logged.step, column]])
 
 
 @dataclass(frozen=True, eq=False)

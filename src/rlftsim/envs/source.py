@@ -10,6 +10,7 @@ import torch
 from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
+from rlftsim.envs.sumo_traffic import check_sumo
 from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.jobs.threads import one_thread
@@ -17,6 +18,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, Scenarios, list_scenario_ids
 
@@ -72,6 +74,8 @@ class Source:
         self.scenario_ids = list(list_scenario_ids(self.scenarios))
         self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}
         self.rules.setdefault("*", config.traffic)
+        if "sumo" in self.rules.values():
+            check_sumo()
         # IDM leaves pedestrians and cyclists to the policy
         needs_policy = "policy" in self.rules.values() or "idm" in self.rules.values() or config.action == "token"
         self.policy = (
@@ -113,7 +117,7 @@ class Source:
             raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
         world = build_world(
             scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
-            context=self._context(scenarios),
+            context=self._context(scenarios), data=dataset_folder(self.config.data),
         )  # fmt: skip
         if not len(world.actors):
             raise ConfigError(

@@ -16,6 +16,7 @@ seconds. Motion: x, y, heading, vx, vy.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -25,7 +26,8 @@ from torch import Tensor
 
 from rlftsim.envs.drivers import Driver, Rules, assign_drivers
 from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, begin_idm, build_idm_lines
-from rlftsim.envs.scene import Scene, build_env_scene
+from rlftsim.envs.scene import Lights, Scene, build_env_scene
+from rlftsim.envs.sumo_traffic import SumoScene, SumoState, advance_sumo, begin_sumo, build_sumo_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.threads import one_thread
@@ -73,8 +75,11 @@ class World:
     sampling: Sampling
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
+    sumo_scenes: tuple[SumoScene, ...]
+    """Of each scene where SUMO drives the others; else empty."""
     is_present: Bool[np.ndarray, "B A 91"]
-    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends."""
+    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends. What
+    SUMO has let leave is in `find_presence`."""
     is_observed: Bool[np.ndarray, "B A 91"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
@@ -109,6 +114,8 @@ class WorldState:
     """Dice of each scene, at each decision taken so far and for all that follow (the last entry)."""
     idm_states: tuple[Float[np.ndarray, "_ 2"], ...]
     """Distance along the line, and speed, of the IDM-driven agents of each scene."""
+    sumo_states: tuple[SumoState, ...] = ()
+    """Of each scene where SUMO drives the others."""
 
     @property
     def step(self) -> int:
@@ -129,6 +136,7 @@ def build_world(
     goals: Mapping[str, PointById] | None = None,
     sampling: Sampling = Sampling(),  # noqa: B008
     context: Any = None,
+    data: Path | None = None,
 ) -> World:
     """The world of some scenarios, which step together.
 
@@ -139,9 +147,11 @@ def build_world(
         goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
         sampling: Temperature and truncation of the policy's decisions.
         context: Result of `policy.encode` for these scenarios; None = computed here.
+        data: Folder of the data set, which has the worlds that SUMO runs again.
 
     Raises:
         ConfigError: a rule that does not fit, or agents that follow the policy where `policy` is left out.
+        DataError: SUMO is to drive in a scenario without a world.
     """
     scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
     batch = collate(scenarios)
@@ -155,6 +165,9 @@ def build_world(
         assert policy is not None
         with one_thread(), torch.no_grad():
             context = policy.encode(batch)
+    by_sumo = scenes if (drivers == Driver.SUMO).any() else ()
+    if by_sumo and data is None:
+        raise ConfigError("SUMO drives in scenarios of a data set alone: name its folder as `data`.")
     mask = batch.agent_mask.cpu().numpy()
     valid = padded([scene.valid for scene in scenes], (*shape, TOTAL_STEPS), False)
     # from the current step on all agents exist, but replayed ones are gone after the last state of their log
@@ -183,6 +196,7 @@ def build_world(
         goals=Goals.from_points(batch, goals) if goals and followers else None,
         sampling=sampling,
         lines=tuple(build_idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
+        sumo_scenes=tuple(build_sumo_scene(scene, data) for scene in by_sumo if data is not None),
     )
 
 
@@ -216,7 +230,8 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     idm_states = tuple(begin_idm(lines, scene) for scene, lines in zip(world.scenes, world.lines))
     track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
-    return WorldState(track, z, block, noise, (tuple(dice),), idm_states)
+    sumo_states = tuple(begin_sumo(sumo_scene, scene) for sumo_scene, scene in zip(world.sumo_scenes, world.scenes))
+    return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
@@ -261,10 +276,32 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
             )
             moved_states.append(idm_state)
         idm_states = tuple(moved_states)
-    # 3. the planner's agents; padding stays at zero
+    # 3. agents of SUMO, which sees the ego's new place one step later
+    sumo_states = []
+    for b, (sumo_scene, scene) in enumerate(zip(world.sumo_scenes, world.scenes)):
+        agents = b, slice(len(scene.object_id))
+        sumo_state, motion[agents] = advance_sumo(sumo_scene, state.sumo_states[b], previous[agents], scene, moved[b])
+        sumo_states.append(sumo_state)
+    # 4. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
-    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, idm_states)
+    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, idm_states, tuple(sumo_states))
+
+
+def find_presence(world: World, state: WorldState) -> tuple[Bool[np.ndarray, "B A T"], Bool[np.ndarray, "B A T"]]:
+    """`is_present` and `is_observed` at the T steps of the log's time up to the present one."""
+    num_steps = len(state.track)
+    present, observed = world.is_present[..., :num_steps], world.is_observed[..., :num_steps]
+    if not state.sumo_states:
+        return present, observed
+    last_step = padded([sumo_state.last_step for sumo_state in state.sumo_states], present.shape[:2], 0)
+    is_left = np.arange(num_steps) > last_step[..., None]
+    return present & ~is_left, observed & ~is_left
+
+
+def find_lights(world: World, state: WorldState) -> list[Lights]:
+    """Lights of each scene: those of the log, or as SUMO has shown them up to the present step."""
+    return [sumo_state.lights for sumo_state in state.sumo_states] or [scene.lights for scene in world.scenes]
 
 
 def _follow_levels(

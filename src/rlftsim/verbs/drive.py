@@ -38,7 +38,8 @@ def drive(
         out: Folder for the results.
         model: Traffic model: a run, a model folder or a registered name.
         split: Split of the data set.
-        traffic: Drivers of the other agents, separated by commas: policy, replay, constant_velocity, idm.
+        traffic: Drivers of the other agents, separated by commas: policy, replay, constant_velocity, idm, or
+            sumo for data made by `rlftsim synthesize --keep-worlds`.
         scenario: Ids of the scenarios to drive; left out, all of the split.
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.

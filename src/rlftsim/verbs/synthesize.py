@@ -13,6 +13,7 @@ def synthesize(
     num_scenarios: int = 200,
     seed: int = 0,
     jobs: int = 1,
+    keep_worlds: bool = False,
     work: Work = Work(),  # noqa: B008
 ) -> None:
     """Make synthetic scenarios with SUMO (pip install "rlftsim[synthetic]").
@@ -25,9 +26,12 @@ def synthesize(
         num_scenarios: Scenarios in training and validation together, 4 : 1. No street network is in both.
         seed: Seed of streets and traffic.
         jobs: Processes, each with a street network of its own. Changes no result.
+        keep_worlds: Write what SUMO needs to run each network again, for `rlftsim drive --traffic sumo`. Boxes are
+            then made from the past alone, so the scenarios differ from those without it.
         work: Machines that share the work.
     """
     manifest = generate(
-        destination, num_scenarios=num_scenarios, seed=seed, jobs=jobs, runner=work.runner(jobs, work.on_error)
-    )
+        destination, num_scenarios=num_scenarios, seed=seed, jobs=jobs, runner=work.runner(jobs, work.on_error),
+        keep_worlds=keep_worlds,
+    )  # fmt: skip
     print_line(f"{destination}: {sum(shard.num_rows for shard in manifest.shards)} scenarios.")

@@ -12,17 +12,34 @@ import numpy as np
 import pyarrow.csv
 from jaxtyping import Float
 
+from rlftsim.scenario.synthetic.causal import (
+    REAR_AXLE_FROM_BUMPER,
+    BodyShape,
+    BodyState,
+    SumoPose,
+    advance_body,
+    begin_body,
+    build_shape,
+)
 from rlftsim.scenario.synthetic.network import Lane, Network
 from rlftsim.scenario.synthetic.sumo import DISCARDED_S, RoadUserType, draw_size
 from rlftsim.scenario.types import STEP_S, ObjectType
 
-REAR_AXLE_FROM_BUMPER = 0.78
-"""Fraction of the length between front bumper and rear axle."""
 MIN_LANE_CHANGE_M = 18.0
 LANE_CHANGE_S = 3.0
 BUMPER_SMOOTHING_S = 0.15
 WALK_SMOOTHING_S = 0.6
 WALK_HEADING_SPEED_MPS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Dragging:
+    """SUMO's id of a body that is dragged along by SUMO's position, and all that the next box depends on."""
+
+    sumo_id: str
+    shape: BodyShape
+    states: list[BodyState]
+    """States at the steps of the body's life."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +55,8 @@ class Body:
     is_parked: bool = False
     is_evaluable: bool = True
     """False = never among the tracks to predict (a lot's cars, long vehicles)."""
+    dragging: Dragging | None = None
+    """None = SUMO does not move it, or the box was made with the future."""
 
     @property
     def num_steps(self) -> int:
@@ -167,6 +186,38 @@ def build_vehicle(
     return Body(object_type, path.first_step, center, heading, velocity, size, is_evaluable=is_evaluable)
 
 
+def build_causal_body(
+    sumo_id: str,
+    first_step: int,
+    poses: list[SumoPose],
+    object_type: ObjectType,
+    size: tuple[float, float, float],
+    left_m: float = 0.0,
+    is_evaluable: bool = True,
+) -> Body:
+    """Body whose box at each step is made from SUMO's poses up to the step.
+
+    Args:
+        sumo_id: Name of the road user in SUMO.
+        first_step: Step of the first pose.
+        poses: Poses that SUMO reports, a step each.
+        object_type: Type of the road user.
+        size: Length, width and height in meters.
+        left_m: Habit of the driver, m to the left of the lane's center.
+        is_evaluable: True = the body may be a track to predict.
+    """
+    shape = build_shape(object_type, size[0], left_m)
+    states = [begin_body(shape, poses[0])]
+    motion = [(states[0].center_x, states[0].center_y, math.radians(90.0 - poses[0][2]), 0.0, 0.0)]
+    for pose in poses[1:]:
+        state, moved = advance_body(shape, states[-1], pose)
+        states.append(state)
+        motion.append(moved)
+    rows = np.array(motion)
+    heading, dragging = np.unwrap(rows[:, 2]), Dragging(sumo_id, shape, states)
+    return Body(object_type, first_step, rows[:, :2], heading, rows[:, 3:], size, False, is_evaluable, dragging)
+
+
 def build_pedestrian(
     first_step: int, position: Float[np.ndarray, "n 2"], heading_rad: float, size: tuple[float, float, float]
 ) -> Body:
@@ -271,7 +322,17 @@ def _lane_path(lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: 
     return BumperPath(first_step, center, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
 
 
-def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], rng: np.random.Generator) -> list[Body]:
+def _read_poses(
+    table: dict[str, np.ndarray], user: str, run: np.ndarray, step: np.ndarray
+) -> tuple[str, int, list[SumoPose]]:
+    """SUMO's id, first step and poses of a "vehicle" or "person" whose rows are `run`."""
+    columns = (table[f"{user}_{name}"][run].astype(float).tolist() for name in ("x", "y", "angle"))
+    return str(table[f"{user}_id"][run[0]]), int(step[run[0]]), list(zip(*columns))
+
+
+def read_vehicles(
+    path: Path, network: Network, types: dict[str, RoadUserType], rng: np.random.Generator, is_causal: bool = False
+) -> list[Body]:
     """Bodies of all motor vehicles and bicycles.
 
     Args:
@@ -279,8 +340,10 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
         network: Compiled network; states off the lanes are left out.
         types: Vehicle types by type id, as `write_demand` returns them.
         rng: Generator of heights and of the drivers' habits.
+        is_causal: True = boxes are made from the past alone, as worlds that run again need; False = smooth ones.
     """
     names = ("timestep_time", "vehicle_id", "vehicle_type", "vehicle_speed", "vehicle_pos", "vehicle_lane")
+    names = (*names, "vehicle_x", "vehicle_y", "vehicle_angle")
     table = _read_table(path, names)
     if table is None:
         return []
@@ -290,22 +353,27 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
     bodies = []
     for run in _runs_by_id(table["vehicle_id"], step):
         user_type = types[str(table["vehicle_type"][run[0]])]
-        lane_path = _lane_path(network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
         # a type has one size for SUMO; heights may differ, because SUMO does not know them
         height = user_type.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
         habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))
         size = (user_type.length_m, user_type.width_m, height)
         is_evaluable = user_type.length_m <= LONGEST_EVALUATED_M
+        if is_causal:
+            dragged = _read_poses(table, "vehicle", run, step)
+            bodies.append(build_causal_body(*dragged, user_type.object_type, size, habit[0], is_evaluable))
+            continue
+        lane_path = _lane_path(network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
         bodies.append(build_vehicle(lane_path, user_type.object_type, size, habit, is_evaluable))
     return bodies
 
 
-def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
+def read_pedestrians(path: Path, rng: np.random.Generator, is_causal: bool = False) -> list[Body]:
     """Bodies of all pedestrians.
 
     Args:
         path: Trajectory file of the persons, CSV; without a file there are no pedestrians.
         rng: Generator of the pedestrians' sizes.
+        is_causal: True = boxes are made from the past alone, as worlds that run again need; False = smooth ones.
     """
     names = ("timestep_time", "person_id", "person_x", "person_y", "person_angle")
     table = _read_table(path, names)
@@ -319,8 +387,12 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
             # SUMO moves a few of them at once to the other side of a junction; smoothing hides jumps of a meter only
             continue
         # SUMO's angles are clockwise from north
+        size = draw_size(rng, "pedestrian")
+        if is_causal:
+            bodies.append(build_causal_body(*_read_poses(table, "person", run, step), ObjectType.PEDESTRIAN, size))
+            continue
         heading = np.pi / 2 - np.radians(float(table["person_angle"][run[0]]))
-        bodies.append(build_pedestrian(int(step[run[0]]), position, heading, draw_size(rng, "pedestrian")))
+        bodies.append(build_pedestrian(int(step[run[0]]), position, heading, size))
     return bodies
 
 

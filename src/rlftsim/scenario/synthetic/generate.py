@@ -29,8 +29,9 @@ from rlftsim.scenario.dataset import (
 )
 from rlftsim.scenario.shards import ShardReader, ShardWriter, check_scenario
 from rlftsim.scenario.synthetic import sumo
-from rlftsim.scenario.synthetic.windows import cut_scenarios
+from rlftsim.scenario.synthetic.windows import cut_windows
 from rlftsim.scenario.synthetic.world import simulate_world
+from rlftsim.scenario.synthetic.worlds import WORLDS, write_world
 from rlftsim.scenario.types import Scenario
 
 GENERATOR_VERSION = 1
@@ -70,6 +71,8 @@ class NetworkTask:
     network_type: str
     num_scenarios: int
     seed: tuple[int, ...]
+    worlds: Path | None = None
+    """Folder of the worlds that SUMO can run again; None = they are not kept."""
 
     @property
     def shard_name(self) -> str:
@@ -77,8 +80,13 @@ class NetworkTask:
         return f"{self.split}_{self.index:05d}.arrow"
 
 
-def plan_networks(request: SyntheticRequest) -> list[NetworkTask]:
-    """Networks of all splits; no two splits share a network, because the seed of a network contains the split."""
+def plan_networks(request: SyntheticRequest, worlds: Path | None = None) -> list[NetworkTask]:
+    """Networks of all splits; no two splits share a network, because the seed of a network contains the split.
+
+    Args:
+        request: Arguments of the data set.
+        worlds: Folder of the worlds that SUMO can run again; None = they are not kept.
+    """
     tasks = []
     for split_number, (split, fraction) in enumerate(request.splits.items()):
         total = round(request.num_scenarios * fraction)
@@ -88,7 +96,7 @@ def plan_networks(request: SyntheticRequest) -> list[NetworkTask]:
         # cumulated and rounded, so that the numbers add up to the total
         counts = np.diff(np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)).tolist()
         for k, (network_type, num_scenarios) in enumerate(zip(types, counts)):
-            tasks.append(NetworkTask(split, k, network_type, num_scenarios, (request.seed, split_number, k)))
+            tasks.append(NetworkTask(split, k, network_type, num_scenarios, (request.seed, split_number, k), worlds))
     return tasks
 
 
@@ -103,10 +111,14 @@ def generate_scenarios(task: NetworkTask) -> Iterator[Scenario]:
         seed = (*task.seed, attempt)
         # SUMO's files are large: they are removed with the network
         with tempfile.TemporaryDirectory(prefix="rlftsim_synthetic_") as name:
-            world = simulate_world(task.network_type, seed, Path(name))
-        for scenario in islice(cut_scenarios(world, np.random.default_rng((*seed, 1))), missing):
+            world = simulate_world(task.network_type, seed, Path(name), keeps_source=task.worlds is not None)
+        windows = []
+        for window in islice(cut_windows(world, np.random.default_rng((*seed, 1))), missing):
             missing -= 1
-            yield scenario
+            windows.append(window)
+            yield window.scenario
+        if task.worlds is not None:
+            write_world(task.worlds, world, windows)
         if missing == 0:
             return
     raise RlftsimError(
@@ -123,6 +135,7 @@ def generate(
     runner: Runner | None = None,
     splits: Mapping[str, float] | None = None,
     scenarios_per_network: int = 10,
+    keep_worlds: bool = False,
     show_progress: bool = True,
 ) -> Manifest:
     """Make a data set of synthetic scenarios. The same arguments and versions give the same tracks.
@@ -137,6 +150,8 @@ def generate(
         runner: Runner of the work in place of such processes, see `rlftsim.jobs.runner`.
         splits: Fraction of the scenarios by split, which share no network; None = 80 % training, 20 % validation.
         scenarios_per_network: Number of scenarios cut from a city; a freeway gives half as many.
+        keep_worlds: True = worlds/NETWORK.world holds what SUMO needs to run each network again; boxes are then made
+            from the past alone, and the future has no label noise.
         show_progress: False prints neither progress nor the time left.
 
     Returns:
@@ -151,7 +166,7 @@ def generate(
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
     check_folder(folder, "data set")
-    tasks = plan_networks(request)
+    tasks = plan_networks(request, folder / WORLDS if keep_worlds else None)
     runner = runner or choose_runner(jobs, len(tasks))
     check_begun(runner, folder)
     if not sumo.is_available():
@@ -165,6 +180,7 @@ def generate(
         "arguments": asdict(request),
         "license": "CC0-1.0",
         "networks": [{"shard": task.shard_name, "kind": task.network_type, "seed": list(task.seed)} for task in tasks],
+        **({"keep_worlds": True} if keep_worlds else {}),
     }
     if (folder / MANIFEST).exists() and not (folder / INCOMPLETE).exists():
         manifest = read_manifest(folder)

@@ -17,6 +17,13 @@ from rlftsim.scenario.types import ObjectType
 INSTALL_HINT = 'Making synthetic scenarios needs SUMO and shapely: pip install "rlftsim[synthetic]".'
 SIMULATED_S = 300
 DISCARDED_S = 60
+OPTIONS = (
+    "--step-length", "0.1", "--default.action-step-length", "0.1", "--step-method.ballistic",
+    "--begin", "0", "--end", f"{SIMULATED_S}", "--time-to-teleport", "-1", "--collision.action", "warn",
+    "--lanechange.duration", "3", "--precision", "4", "--no-step-log", "--no-warnings", "--xml-validation", "never",
+    "--ignore-route-errors",
+)  # fmt: skip
+"""Options of the simulation, which decide the traffic together with network, routes and seed."""
 
 _VEHICLES = "passenger bus truck delivery motorcycle bicycle"
 _ALLOWED = {"sidewalk": "pedestrian", "bicycle": "bicycle", "travel": _VEHICLES}
@@ -158,13 +165,9 @@ def simulate(network: Path, routes: Path, additional: Path, seed: int) -> tuple[
     """
     folder = network.parent
     _run(
-        "sumo", "-n", network, "-r", routes, "-a", additional, "--seed", seed,
-        "--step-length", 0.1, "--default.action-step-length", 0.1, "--step-method.ballistic",
-        "--begin", 0, "--end", SIMULATED_S, "--time-to-teleport", -1, "--collision.action", "warn",
-        "--lanechange.duration", 3, "--fcd-output", folder / "vehicles.csv",
-        "--person-fcd-output", folder / "persons.csv", "--device.fcd.begin", DISCARDED_S,
-        "--fcd-output.attributes", "x,y,angle,type,speed,pos,lane", "--precision", 4,
-        "--no-step-log", "--no-warnings", "--xml-validation", "never", "--ignore-route-errors",
+        "sumo", "-n", network, "-r", routes, "-a", additional, "--seed", seed, *OPTIONS,
+        "--fcd-output", folder / "vehicles.csv", "--person-fcd-output", folder / "persons.csv",
+        "--device.fcd.begin", DISCARDED_S, "--fcd-output.attributes", "x,y,angle,type,speed,pos,lane",
     )  # fmt: skip
     return folder / "vehicles.csv", folder / "persons.csv"
 

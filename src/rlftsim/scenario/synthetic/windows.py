@@ -130,6 +130,17 @@ _LIGHT_STATES = {
 """WOMD's states, without and with an arrow, for the letters of SUMO; all others mean stop."""
 
 
+@dataclass(frozen=True)
+class SumoSource:
+    """All that SUMO needs to run a world again, besides `sumo.OPTIONS`."""
+
+    network: str
+    """XML of the compiled network."""
+    routes: str
+    """XML of types, trips and walks with routes."""
+    seed: int
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """A simulated network with traffic, from which windows are cut."""
@@ -142,6 +153,19 @@ class World:
     ends: Float[np.ndarray, "n 2"]
     """Positions of the network's ends."""
     num_steps: int
+    source: SumoSource | None = None
+    """None = boxes are smooth, made with the future, and the world is not run again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A scenario and its origin in a world."""
+
+    scenario: Scenario
+    start: int
+    """Step of the recording at which the scenario begins."""
+    bodies: list[Body]
+    """Bodies of the tracks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,6 +325,10 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
         if not body.is_parked:
             noise = float(rng.gamma(1.6, 0.0078))  # m along the heading: median 10 mm, with a long tail
             position[k], heading[k], velocity[k] = add_label_noise(rng, noise, position[k], heading[k], velocity[k])
+    if world.source is not None:  # what a planner sees of the others as they go on has no label noise
+        future = slice(CURRENT_STEP + 1, None)
+        position[:, future], heading[:, future] = view.position[:, future], view.heading[:, future]
+        velocity[:, future] = view.velocity[:, future]
     size = np.array([body.size for body in view.bodies])
     z = world.cropper.ground.height_at(position) + size[:, None, 2] / 2
     heading = np.arctan2(np.sin(heading), np.cos(heading))
@@ -347,7 +375,7 @@ def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Bod
     return [first]
 
 
-def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) -> Scenario | None:
+def cut_window(world: World, start: int, ego: Body, rng: np.random.Generator) -> Window | None:
     """Scenario of a window from the ego's view; None if the window fails a gate.
 
     Args:
@@ -369,7 +397,7 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
     features = world.cropper.crop(ego_path[::6], range_m + MAP_BEYOND_RANGE_M)
     # an id that is stable, and unlike those of other worlds
     name = f"{world.name}/{start}/{world.bodies.index(ego)}"
-    return Scenario(
+    scenario = Scenario(
         scenario_id=hashlib.sha256(name.encode()).hexdigest()[:16],
         timestamps_s=np.round(np.arange(TOTAL_STEPS) * STEP_S, 1),
         tracks=_label(view, world, rng),
@@ -381,10 +409,11 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
         objects_of_interest=np.zeros(0, np.int64),
         source="synthetic",
     )
+    return Window(scenario, start, view.bodies)
 
 
-def cut_scenarios(world: World, rng: np.random.Generator) -> Iterator[Scenario]:
-    """Scenarios of a world in random order, without windows that fail a gate.
+def cut_windows(world: World, rng: np.random.Generator) -> Iterator[Window]:
+    """Windows of a world in random order, without windows that fail a gate.
 
     No two scenarios overlap in time and position.
 
@@ -395,6 +424,6 @@ def cut_scenarios(world: World, rng: np.random.Generator) -> Iterator[Scenario]:
     starts = rng.permutation(np.arange(FIRST_START, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
     for start in starts.tolist():
         for ego in _choose_egos(world, start, rng):
-            scenario = cut_scenario(world, start, ego, rng)
-            if scenario is not None:
-                yield scenario
+            window = cut_window(world, start, ego, rng)
+            if window is not None:
+                yield window

@@ -12,20 +12,21 @@ from rlftsim.scenario.synthetic.network import read_network
 from rlftsim.scenario.synthetic.parking import park_in_lots, park_in_strips
 from rlftsim.scenario.synthetic.street_plan import draw_city_plan, draw_freeway_plan
 from rlftsim.scenario.synthetic.sumo import write_demand
-from rlftsim.scenario.synthetic.windows import World
+from rlftsim.scenario.synthetic.windows import SumoSource, World
 from rlftsim.scenario.types import STEP_S
 
 LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
 _NUM_STEPS = round((sumo.SIMULATED_S - sumo.DISCARDED_S) / STEP_S)
 
 
-def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> World:
+def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path, keeps_source: bool = False) -> World:
     """Draw a network, let SUMO fill it with traffic, and turn the output into bodies, lights and a map.
 
     Args:
         network_type: Type of the network, "city", "quiet" or "freeway".
         seed: Seed of all choices; the same seed and version of SUMO give the same world.
         folder: Existing folder for SUMO's files; the caller deletes the files.
+        keeps_source: True = the world holds what SUMO needs to run it again, and boxes are made from the past alone.
 
     Raises:
         ConfigError: SUMO is not installed.
@@ -52,11 +53,14 @@ def simulate_world(network_type: str, seed: tuple[int, ...], folder: Path) -> Wo
 
     # 3. Map and bodies.
     network_map = build_network_map(network)
-    bodies = read_vehicles(vehicles_file, network, types, rng)
-    bodies += read_pedestrians(persons_file, rng)
+    bodies = read_vehicles(vehicles_file, network, types, rng, keeps_source)
+    bodies += read_pedestrians(persons_file, rng, keeps_source)
     bodies += park_in_strips(rng, network, _NUM_STEPS)
     bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[network_type])
     cropper = MapCropper(network_map, draw_ground(rng))
     signals = {junction: read_signals(path) for junction, path in signal_files.items()}
     ends = np.stack([node.position for node in plan.fringe_nodes])
-    return World("/".join(map(str, seed)), tuple(bodies), cropper, signals, ends, _NUM_STEPS)
+    # other boxes than those of the same seed without a source, so other ids
+    name = "/".join(map(str, (*seed, "source")[: len(seed) + keeps_source]))
+    source = SumoSource(network_file.read_text(), routes.read_text(), sumo_seed) if keeps_source else None
+    return World(name, tuple(bodies), cropper, signals, ends, _NUM_STEPS, source)
