@@ -20,7 +20,7 @@ import tempfile
 import zipfile
 from typing import Any
 
-import libsumo
+import libsumo  # pyright: ignore[reportMissingImports]
 
 NETWORK, ROUTES, DOCUMENT = "network.net.xml", "demand.rou.xml", "world.json"
 """Members of the archive of a world."""
