@@ -21,6 +21,7 @@ from jaxtyping import Float, Int64
 
 from rlftsim.envs.scene import GREEN, RED, YELLOW, Lights, Scene
 from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.jobs.documents import parse_json
 from rlftsim.scenario.synthetic.causal import BodyState, SumoPose, advance_body
 from rlftsim.scenario.synthetic.crop import on_grid
 from rlftsim.scenario.synthetic.windows import HEADING_GRID_PER_RAD, POSITION_GRID_PER_M, VELOCITY_GRID_PER_MPS
@@ -202,7 +203,7 @@ class SumoWorld:
         self.channels[window, poses] = channel
         while len(self.channels) > MAX_EPISODES:
             self.channels.popitem(last=False)[1].close()
-        return json.loads(answer)
+        return parse_json(answer, REMEDY, source="the answer of SUMO")
 
     def _open(self, window: int) -> socket.socket:
         """Socket of a new episode, in which SUMO stands at the current step of a window."""

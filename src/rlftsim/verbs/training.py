@@ -134,7 +134,7 @@ def find_held_out(
 
     Args:
         data: Training scenarios as they were handed over; only a data set has a split to validate on.
-        training: Training scenarios; where the split is not named, none of them is validated on.
+        training: Training scenarios; "auto" validates on none of them, a number only warns about it.
         split: Split to validate on; None = "tune", where the data set has a split "validation".
         every: Updates between two validations, or "auto"; 0 = none.
 
@@ -157,8 +157,10 @@ def find_held_out(
         return None
     held_out = open_dataset(data, split or TUNE)
     if split is None and not set(held_out.scenario_ids).isdisjoint(list_scenario_ids(training)):
-        log.info(f"no validation: the training scenarios are of the split {VALIDATION!r}, too.")
-        return None
+        if every == "auto":
+            log.info(f"no validation: the training scenarios are of the split {VALIDATION!r}, too.")
+            return None
+        log.warning("the validation has training scenarios, too: name others with --validation-split.")
     return held_out
 
 

@@ -154,10 +154,10 @@ class CalibratedPolicy(nn.Module):
         eta: Sequence[float] | None = None,
         calibration: Mapping[str, Any] | None = None,
     ):
-        if not (isinstance(base, nn.Module) and isinstance(base, TokenPolicy)):
-            raise ConfigError(
-                f"a {type(base).__name__} cannot be calibrated: it has no weights or no vocabulary; fine-tune by rlft."
-            )
+        if not isinstance(base, nn.Module):
+            raise ConfigError(f"{type(base).__name__} has no weights: there is nothing to calibrate.")
+        if not isinstance(base, TokenPolicy):
+            raise ConfigError(f"{type(base).__name__} has no vocabulary to calibrate: fine-tune by rlft.")
         super().__init__()
         self.base: Any = base
         self.features = tuple(features)

@@ -1,6 +1,6 @@
-"""SUMO in a separate process, forked at the current step of every window and again for every episode.
+"""SUMO in a process, forked at the current step of every window and again for every episode.
 
-Started by `python -m rlftsim.scenario.synthetic.rerun WORLD SOCKET`; imports libsumo, and nothing else of this package.
+Started by `python -m rlftsim.scenario.synthetic.rerun WORLD SOCKET`; imports libsumo and the parser of JSON alone.
 SUMO stores no state exactly: a copied process is the only copy of a state that goes on bit for bit. The processes:
 
 1. The first walks through the network. It receives an index of a window with the socket of an episode.
@@ -22,6 +22,8 @@ from typing import Any
 
 import libsumo  # pyright: ignore[reportMissingImports]
 
+from rlftsim.jobs.documents import parse_json
+
 NETWORK, ROUTES, DOCUMENT = "network.net.xml", "demand.rou.xml", "world.json"
 """Members of the archive of a world."""
 DIGITS = 4
@@ -32,7 +34,7 @@ STRANGER_WITHIN_M = 20.0
 def start_sumo(path: str) -> list[dict[str, Any]]:
     """Start the simulation of a world; returns the windows in the order of the current steps."""
     with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:
-        document = json.loads(archive.read(DOCUMENT))
+        document = parse_json(archive.read(DOCUMENT), "make the data set again", source=DOCUMENT)
         files = [archive.extract(name, folder) for name in (NETWORK, ROUTES)]
         # all routes at once: forked processes would share the position in the open file
         options = [*document["options"], "--seed", str(document["seed"]), "--route-steps", "0"]
@@ -105,7 +107,7 @@ class Episode:
     def serve(self, channel: socket.socket) -> None:
         """Answer lists of poses, a line of JSON each, until the channel is closed."""
         for line in channel.makefile():
-            for pose in json.loads(line):
+            for pose in parse_json(line, "start again", source="the poses", expected=list):
                 self.step(pose)
             channel.sendall(json.dumps(self.describe()).encode() + b"\n")
 
