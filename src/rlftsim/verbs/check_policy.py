@@ -4,8 +4,7 @@ from rlftsim.rollout.check import CheckReport
 from rlftsim.rollout.check import check_policy as check_contract
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Model
-from rlftsim.verbs.inputs import to_policy
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import to_policy, with_checked_arguments
 
 
 @with_checked_arguments

@@ -13,8 +13,7 @@ from rlftsim.rollout.contract import CheckReport
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.open import open_dataset
 from rlftsim.verbs.arguments import Data
-from rlftsim.verbs.inputs import to_batch
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import to_batch, with_checked_arguments
 
 NUM_ROLLOUTS = 3
 

@@ -15,8 +15,7 @@ from rlftsim.evaluation.drive_results import (
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.jobs.progress import print_wide
 from rlftsim.verbs.arguments import Result, Results
-from rlftsim.verbs.inputs import read_result
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import read_result, with_checked_arguments
 
 
 @with_checked_arguments

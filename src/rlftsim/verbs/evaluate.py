@@ -17,8 +17,7 @@ from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
-from rlftsim.verbs.inputs import find_policy_name, to_policy, to_sampling
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import find_policy_name, to_policy, to_sampling, with_checked_arguments
 
 
 @with_checked_arguments

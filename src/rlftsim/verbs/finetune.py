@@ -26,8 +26,7 @@ from rlftsim.training.config import (
 from rlftsim.training.registry import METHODS, find_method, method_by_name
 from rlftsim.verbs.arguments import AnyRecipe, Data, File, Model, OnUpdate, Processes, Settings
 from rlftsim.verbs.commands import FINETUNING
-from rlftsim.verbs.inputs import check_config, to_recipe
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import check_config, to_recipe, with_checked_arguments
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
 from rlftsim.verbs.runs import print_model, repeat_for_seeds
 from rlftsim.verbs.training import (

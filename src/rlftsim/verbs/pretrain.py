@@ -14,8 +14,7 @@ from rlftsim.scenario.open import to_scenarios
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.config import PretrainConfig
 from rlftsim.verbs.arguments import Data, File, Model, ModelOrRecipe, OnUpdate, Processes, Settings
-from rlftsim.verbs.inputs import check_config, to_recipe
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import check_config, to_recipe, with_checked_arguments
 from rlftsim.verbs.recipe_flags import RecipeFlags, find_value
 from rlftsim.verbs.runs import print_model, repeat_for_seeds
 from rlftsim.verbs.training import (

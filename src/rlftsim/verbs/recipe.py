@@ -7,8 +7,7 @@ from rlftsim.jobs.progress import print_line, print_lines
 from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import recipe_as_json, recipe_as_text
 from rlftsim.verbs.arguments import Name
-from rlftsim.verbs.inputs import to_recipe
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import to_recipe, with_checked_arguments
 
 
 @with_checked_arguments

@@ -15,8 +15,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, dataset_folder
 from rlftsim.verbs.arguments import Data, Device, File, Models, Results, Runs
-from rlftsim.verbs.inputs import read_result, to_policy, validate_name
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import read_result, to_policy, validate_name, with_checked_arguments
 
 
 @with_checked_arguments

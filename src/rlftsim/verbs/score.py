@@ -18,8 +18,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.verbs.arguments import Data, File, ScoreMetric, Simulated
-from rlftsim.verbs.inputs import check_left_out, to_batch
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import check_left_out, to_batch, with_checked_arguments
 from rlftsim.viewer.notebook import check_rollouts
 
 IN_FILES = ("out", "name", "explain", "missing_map", "missing_scenario", "limit", "jobs", "work")

@@ -20,8 +20,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset, to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goals import check_goal_effects, check_scenarios, read_given_goals
-from rlftsim.verbs.inputs import check_left_out, to_batch, to_policy, to_sampling
-from rlftsim.verbs.keywords import with_checked_arguments
+from rlftsim.verbs.inputs import check_left_out, to_batch, to_policy, to_sampling, with_checked_arguments
 
 IN_FILES = ("scenario", "limit", "goal", "picture", "export", "jobs", "work")
 """Arguments without effect on rollouts in memory."""

@@ -3,7 +3,15 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from rlftsim import errors
+from rlftsim.errors import (
+    ConfigError,
+    check_finiteness,
+    check_limits,
+    check_not_negative,
+    check_positive,
+    check_types,
+    given,
+)
 
 WINDOW = 11
 """Steps of 0.1 s that an agent or a light is seen for, the current one included."""
@@ -76,28 +84,28 @@ class TrafficBotsConfig:
     """Decisions that are scored with gradient at once; fewer need less memory, the result is the same."""
 
     def __post_init__(self) -> None:
-        errors.check_types(self)
+        check_types(self)
         sizes = ("dim", "num_heads", "num_map_layers", "num_light_layers", "num_agent_layers")
         neighbors = ("map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors")
         distances = ("radius_m", "light_radius_m", "noise_acceleration_mps2", "noise_yaw_rate_radps")
-        distances += errors.given(self, ("noise_pedestrian_yaw_rate_radps",))
-        counts = ("agent_neighbors", "forcing_updates", "steps_per_pass", *errors.given(self, ("max_map_tokens",)))
-        errors.check_positive(self, (*sizes, *neighbors, *distances, *counts))
-        errors.check_finiteness(self, (*distances, "free_nats"))
-        errors.check_not_negative(self, ("free_nats",))
-        errors.check_limits(self, dict.fromkeys(("num_map_layers", "num_light_layers", "num_agent_layers"), 256))
-        errors.check_limits(self, dict.fromkeys(("dim", "num_heads"), 65_536) | dict.fromkeys(distances, 100_000))
-        errors.check_limits(self, dict.fromkeys((*neighbors, *counts), 2**31 - 1))
+        distances += given(self, ("noise_pedestrian_yaw_rate_radps",))
+        counts = ("agent_neighbors", "forcing_updates", "steps_per_pass", *given(self, ("max_map_tokens",)))
+        check_positive(self, (*sizes, *neighbors, *distances, *counts))
+        check_finiteness(self, (*distances, "free_nats"))
+        check_not_negative(self, ("free_nats",))
+        check_limits(self, dict.fromkeys(("num_map_layers", "num_light_layers", "num_agent_layers"), 256))
+        check_limits(self, dict.fromkeys(("dim", "num_heads"), 65_536) | dict.fromkeys(distances, 100_000))
+        check_limits(self, dict.fromkeys((*neighbors, *counts), 2**31 - 1))
         if self.dim % 16 or self.dim % self.num_heads:
-            raise errors.ConfigError(f"dim={self.dim} must be a multiple of 16 and of num_heads={self.num_heads}.")
+            raise ConfigError(f"dim={self.dim} must be a multiple of 16 and of num_heads={self.num_heads}.")
         for name in ("dropout", "input_drop", "noise_correlation"):
             if not 0 <= getattr(self, name) < 1:
-                raise errors.ConfigError(f"{name} is in [0, 1), got {getattr(self, name)}.")
+                raise ConfigError(f"{name} is in [0, 1), got {getattr(self, name)}.")
         if not 0 <= self.prior_probability <= 1:
-            raise errors.ConfigError(f"prior_probability is in [0, 1], got {self.prior_probability}.")
+            raise ConfigError(f"prior_probability is in [0, 1], got {self.prior_probability}.")
         fractions = self.forced_fractions
         if not fractions or not all(0 <= fraction <= 1 for fraction in fractions):
-            raise errors.ConfigError(f"forced_fractions are one or more fractions in [0, 1], got {fractions}.")
+            raise ConfigError(f"forced_fractions are one or more fractions in [0, 1], got {fractions}.")
 
 
 def trafficbots_v15() -> TrafficBotsConfig:
