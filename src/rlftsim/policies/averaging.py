@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError
+from rlftsim.policies.calibrated.policy import CalibratedPolicy, average_calibrations
 from rlftsim.rollout.fingerprint import fingerprint_policy
 
 
@@ -41,6 +42,8 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
     if scale != 1.0 and base is None:
         raise ConfigError(f"scale={scale:g} needs the base that the policies were fine-tuned from.")
     first = policies[0]
+    if isinstance(first, CalibratedPolicy) and base is not None and not isinstance(base, CalibratedPolicy):
+        base = CalibratedPolicy(base, first.features)  # with weights of 0
     for number, policy in enumerate(policies, 1):
         _check_same_settings(first, policy, f"policy {number} of {len(policies)}")
     if base is not None:
@@ -56,6 +59,9 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
             weight.copy_(mean if scale == 1.0 else origin + scale * (mean - origin))
             if not weight.isfinite().all():
                 raise ConfigError(f"{name} is not finite in the average with scale={scale:g}.")
+    if isinstance(average, CalibratedPolicy):
+        accounts = [policy.calibration for policy in policies]
+        average.set_calibration(average.eta, average_calibrations(accounts, scale))
     return average
 
 

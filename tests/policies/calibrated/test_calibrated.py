@@ -11,7 +11,7 @@ import tiny
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.calibrated.features import FEATURES, TiltedDistribution, features_by_name, register_feature
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
@@ -186,7 +186,7 @@ def test_further_training_moves_the_base_below_a_fixed_eta(calibrated):
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (lambda base: CalibratedPolicy(ConstantVelocity(), NAMES), "no weights or no vocabulary"),
+        (lambda base: CalibratedPolicy(ConstantVelocity(), NAMES), "ConstantVelocity has no weights"),
         (lambda base: CalibratedPolicy(base, ["speed_slw"]), "did you mean 'speed_slow'"),
         (lambda base: CalibratedPolicy(base, ["speed_slow"] * 2), "different names"),
         (lambda base: CalibratedPolicy(base, NAMES, [1.0]), "one for each"),
@@ -212,3 +212,25 @@ def test_a_feature_of_ones_own_works_by_its_name_and_its_shape_is_checked(base):
     finally:
         FEATURES.remove("half_speed")
         FEATURES.remove("by_agent")
+
+
+def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_what_it_earns(base, tmp_path):
+    runs = []
+    for eta, gain in ((0.2, 0.01), (0.4, 0.03)):
+        row = {"feature": "speed_fast", "eta": eta, "t": 2.0} | dict.fromkeys(
+            ("rmm", "kinematic", "interactive", "map_based"), gain
+        )
+        held_back = {"length": 0.7, "kl": 0.003} | dict.fromkeys(CHANGES, {"change": 0.01, "t": 1.0})
+        account = {
+            "num_scenarios": [8, 2], "num_rollouts": 8, "constraints": ["speed"], "length": 0.7, "features": [row],
+            "held_back": [held_back],
+        }  # fmt: skip
+        runs.append(CalibratedPolicy(base, ["speed_fast"], [eta], account))
+    average_policies(runs, base=base, scale=3).save_pretrained(tmp_path)
+    average = load_policy(tmp_path)
+    assert average.eta.tolist() == pytest.approx([0.9])
+    row = average.calibration["features"][0]
+    assert (row["eta"], row["rmm"], row["t"]) == pytest.approx((0.9, 0.06, 2.0))
+    card = (tmp_path / "README.md").read_text()
+    assert "| speed_fast | +0.900 | +2.0 | +0.0600 |" in card
+    assert "Measured on" not in card

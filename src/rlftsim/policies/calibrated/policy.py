@@ -81,6 +81,12 @@ def calibration_table(calibration: Mapping[str, Any]) -> str:
         [f"{row['length']:g}", f"{row['kl']:.4f}", *(_with_t(row[name], style) for name, (_, style) in CHANGES.items())]
         for row in calibration["held_back"]
     ]
+    measured = f"""
+Measured on {num_held_back} scenarios that were held back, with t in parentheses. The length taken is
+{calibration["length"]:.2f}.
+
+{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), lengths)}
+"""
     return f"""## Calibration
 
 What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {num_fitted} scenarios with
@@ -88,12 +94,25 @@ What a feature earns in RMM, and of that in which sub-score, is predicted to fir
 Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "nothing"}.
 
 {_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), features)}
+{measured if lengths else ""}"""
 
-Measured on {num_held_back} scenarios that were held back, with t in parentheses. The length taken is
-{calibration["length"]:.2f}.
 
-{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), lengths)}
-"""
+def average_calibrations(calibrations: Sequence[Mapping[str, Any]], scale: float) -> dict[str, Any]:
+    """Account of the mean of several calibrations; empty where one of these has none.
+
+    Args:
+        calibrations: Values of calibration.json of runs with the same features.
+        scale: Length of the step from the base to the mean.
+    """
+    if not all(calibrations):
+        return {}
+    table = []
+    for rows in zip(*(calibration["features"] for calibration in calibrations)):
+        means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0] if name != "feature"}
+        scaled = {name: mean if name == "t" else scale * mean for name, mean in means.items()}
+        table.append({"feature": rows[0]["feature"], **scaled})
+    # what the runs measured on scenarios held back is not true of the mean
+    return {**calibrations[0], "length": scale, "features": table, "held_back": []}
 
 
 def _with_t(change: Mapping[str, float], style: str) -> str:
