@@ -220,7 +220,7 @@ def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_wh
         row = {"feature": "speed_fast", "eta": eta, "t": 2.0} | dict.fromkeys(
             ("rmm", "kinematic", "interactive", "map_based"), gain
         )
-        held_back = {"length": 0.7, "kl": 0.003} | dict.fromkeys(CHANGES, {"change": 0.01, "t": 1.0})
+        held_back = {"length": 0.7, "kl": 0.003} | {name: {"change": 0.01, "t": 1.0} for name in CHANGES}
         account = {
             "num_scenarios": [8, 2], "num_rollouts": 8, "constraints": ["speed"], "length": 0.7, "features": [row],
             "held_back": [held_back],
