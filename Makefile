@@ -21,7 +21,7 @@ demo-quick: $(BIN)/.installed
 
 ## lint, types and tests
 test: $(BIN)/.installed-test lint types
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --jaxtyping-packages=rlftsim,beartype.beartype $(PYTEST_FLAGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --jaxtyping-packages=rlftsim,beartype.beartype $(PYTEST_FLAGS)
 
 lint: $(BIN)/.installed-test
 	$(BIN)/ruff check src tests benchmarks docs

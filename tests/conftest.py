@@ -30,6 +30,12 @@ if hasattr(tarfile, "data_filter"):
     tarfile.TarFile.extraction_filter = staticmethod(tarfile.data_filter)
 
 
+def pytest_collection_modifyitems(items):
+    """Files with slow tests come first, so that at the end no process is left with a long one."""
+    slow_files = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow_files)
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder with official material that is not part of the repository: RLFTSIM_SHARED, else ../shared."""

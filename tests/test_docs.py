@@ -91,6 +91,7 @@ def names_of(page: Path) -> dict[str, object]:
     return {}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_the_page_runs_and_prints_what_it_shows(page, things, monkeypatch, tmp_path):

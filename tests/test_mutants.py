@@ -76,6 +76,7 @@ def names_of_formats():
     return [key.value for key in table.value.keys]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names_of_formats())
 def test_a_damaged_file_ends_as_a_result_or_as_one_line(outcomes, name):
     faults, counts = outcomes[name]["faults"], outcomes[name]["counts"]

@@ -105,6 +105,7 @@ def test_a_planner_that_fails_after_the_pilot_loses_the_scenario_and_no_other(tm
     assert "per 1 000 km" in printed
 
 
+@pytest.mark.slow
 def test_however_the_work_is_done_and_interrupted_the_bytes_are_the_same(tmp_path, capsys):
     whole, shared = tmp_path / "whole", tmp_path / "shared"
     assert main([*LINE, "--out", str(whole), "--films", "1"]) == 0
