@@ -16,12 +16,12 @@ def demo_base() -> SmartPolicy:
 
 
 def demo_tuned() -> SmartPolicy:
-    """`demo_base` after MLOO that holds speed: fewer collisions and less driving off the road, as fast as before."""
+    """demo-base after MLOO that holds speed: fewer collisions and less driving off the road, as fast as before."""
     return _with_changes(demo_base(), "demo-tuned")
 
 
 def demo_goals() -> SmartPolicy:
-    """`demo_base` with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
+    """demo-base with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
     return _with_changes(demo_base().with_goal_conditioning("indication", logit_bias=True), "demo-goals")
 
 
