@@ -60,6 +60,8 @@ def test_updates_time_and_memory_are_those_of_the_command_itself(measured, monke
     assert main([*words, "--model", "runs/base", "--config", "mine.json"]) == 0
     assert measured[0][:6] == ["finetune", "smart-demo", "--data", "synthetic", "--out", measured[0][5]]
     assert measured[0][6:] == ["--model", "runs/base", "--config", "mine.json"]
+    # few scenarios alone would be trained on by one process
+    assert measured[1][-4:] == ["--processes", "2", "--finetune.micro-batch-size", "2"]
     out = capsys.readouterr().out
     # 160 scenarios by 2, three times; 2 processes of 2 x 3 GB
     for cells in ("240", "0.5 s (mean of 2)", "2 min", "12.0 GB of 100.0 GB", "2 now, up to 2 fit"):

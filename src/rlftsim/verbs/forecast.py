@@ -59,23 +59,25 @@ class TrainingCommand:
         words = self.write_words(self.data, Path())
         return "pretrain" if self.verb == "pretrain" else choose_method(recipe_by_name(self.recipe), words)
 
-    def write_words(self, data: str | Path, out: Path, micro_batch: int | None = None) -> list[str]:
+    def write_words(self, data: str | Path, out: Path, sizes: tuple[int, int] | None = None) -> list[str]:
         """Words of the command line.
 
         Args:
             data: Data set to train on.
             out: Folder of the run.
-            micro_batch: Scenarios in memory at once; None = as the settings say.
+            sizes: Processes, which few scenarios would not have, and scenarios in memory at once; None = as the
+                settings say.
         """
         words = [self.verb, self.recipe, "--data", str(data), "--out", str(out)]
         model_flag = "--model" if self.verb == "finetune" else "--init-from"
         flags = {"--vocabulary": self.vocabulary, "--config": self.config, "--method": self.method}
         for flag, value in {model_flag: self.model, **flags}.items():
             words += [flag, value] if value is not None else []
-        if micro_batch is None:
+        if sizes is None:
             return words
+        processes, micro_batch = sizes
         section = "finetune" if self.trainer == "rlft" else self.trainer
-        return [*words, f"--{section}.micro-batch-size", str(micro_batch)]
+        return [*words, "--processes", str(processes), f"--{section}.micro-batch-size", str(micro_batch)]
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
         largest = write_largest(dataset, order, batch_size, folder / "largest")
         sizes = dict.fromkeys((min(micro_batch, batch_size), processes))
         peaks = {
-            size: processes * measure_run(command.write_words(largest, out, size), out, 1).peak_bytes
+            size: processes * measure_run(command.write_words(largest, out, (processes, size)), out, 1).peak_bytes
             for size, out in ((size, folder / f"micro-{size}") for size in sizes)
         }
     peak, lowest = peaks[min(micro_batch, batch_size)], peaks[processes]
