@@ -9,7 +9,6 @@ import pytest
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.open import open_dataset
-from rlftsim.training.parallel import scenario_costs
 from rlftsim.verbs import forecast
 from rlftsim.verbs.forecast import (
     MeasuredRun,
@@ -99,13 +98,15 @@ def test_a_forecast_of_a_training_needs_a_recipe(capsys):
 
 def test_memory_is_measured_on_the_largest_batch_of_the_run(tmp_path):
     dataset = open_dataset("synthetic", "validation")
-    costs = scenario_costs(dataset)
-    light, heavy = costs.argsort()[:2], costs.argsort()[-2:]
-    # the two heaviest never meet
-    order = np.array([light[0], heavy[0], heavy[1], light[1], *light])
-    written = open_dataset(write_largest(dataset, order, 2, tmp_path / "largest"), "training")
-    met = {dataset.scenario_ids[position] for position in (light[1], heavy[1])}
-    assert set(written.scenario_ids) == met
+    least, *_, third, second, most = dataset.num_agents.argsort(kind="stable")
+    order = np.array([second, third, least, most])  # beside the most the least is padded to as many
+    written = open_dataset(write_largest(dataset, order, 2, 1, tmp_path / "together"), "training")
+    assert set(written.scenario_ids) == {dataset.scenario_ids[position] for position in (least, most)}
+    # of two processes one has the most alone, which is less than two of another batch
+    assert dataset.num_agents[most] < 2 * dataset.num_agents[third]
+    order = np.array([most, least, least, least, third, second, third, second])
+    written = open_dataset(write_largest(dataset, order, 4, 2, tmp_path / "apart"), "training")
+    assert set(written.scenario_ids) == {dataset.scenario_ids[position] for position in (third, second)}
 
 
 @pytest.mark.slow

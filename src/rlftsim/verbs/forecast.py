@@ -22,7 +22,7 @@ from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.training.data import scenarios_of_update
-from rlftsim.training.parallel import scenario_costs
+from rlftsim.training.parallel import balance_by_cost, scenario_costs
 from rlftsim.training.registry import method_by_name
 from rlftsim.training.run_folder import flatten, read_metrics, stored_settings
 from rlftsim.verbs.finetune import choose_method
@@ -32,7 +32,7 @@ WARM_UP = 1
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """Bytes that a container may use; "max" = no limit."""
 SECONDS_BETWEEN_LOOKS = 0.05
-MAX_LOOKED_AT = 1_000_000
+MAX_LOOKED_AT = 100_000
 """Scenarios of a run, from its start, among which the largest batch is looked for."""
 COUNTED = ("epochs", "batch_size", "num_scenarios", "held_back", "lengths")
 """Settings that the number of updates follows from, as far as a method has them."""
@@ -134,7 +134,7 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
         log.info("measure the largest batch")
         seed = int(str(run.settings["seed"]))
         order = np.array(scenarios_of_update(0, min(num_updates * batch_size, MAX_LOOKED_AT), len(dataset), seed))
-        largest = write_largest(dataset, order, batch_size, folder / "largest")
+        largest = write_largest(dataset, order, batch_size, processes, folder / "largest")
         sizes = dict.fromkeys((min(micro_batch, batch_size), processes))
         peaks = {
             size: processes * measure_run(command.write_words(largest, out, (processes, size)), out, 1).peak_bytes
@@ -189,20 +189,29 @@ def measure_run(words: list[str], out: Path, num_updates: int) -> MeasuredRun:
     return MeasuredRun(seconds, usage.ru_maxrss * 1024, flatten(stored_settings(out)))
 
 
-def write_largest(dataset: ScenarioDataset, order: Int64[np.ndarray, "n"], batch_size: int, folder: Path) -> Path:
+def write_largest(
+    dataset: ScenarioDataset, order: Int64[np.ndarray, "n"], batch_size: int, processes: int, folder: Path
+) -> Path:
     """Write a data set of the scenarios of the largest batch, all of the split training. Returns its folder.
+
+    In the largest, a process has most agents, padding included: its scenarios times the largest of these.
 
     Args:
         dataset: Scenarios to choose from.
         order: Positions of the scenarios in the order of the run, batch after batch.
         batch_size: Scenarios of a batch; at least two are written, which a calibration needs.
+        processes: Number of processes that share a batch, each with about the same cost.
         folder: Folder to write.
     """
-    size = max(batch_size, 2)
-    costs = np.convolve(scenario_costs(dataset)[order], np.ones(size), "valid")[::size]
-    first = size * int(costs.argmax())
-    batch = dict.fromkeys(order[first : first + size].tolist())  # a small data set is seen twice in a batch
-    write_dataset((dataset[position] for position in batch), folder, split="training")
+    size, costs, agents = max(batch_size, 2), scenario_costs(dataset), dataset.num_agents
+
+    def padded_agents(batch: Int64[np.ndarray, "size"]) -> int:
+        groups = [batch[group] for group in balance_by_cost(costs[batch], processes) if group]
+        return max(len(group) * int(agents[group].max()) for group in groups)
+
+    largest = max(np.resize(order, (max(len(order) // size, 1), size)), key=padded_agents)
+    positions = dict.fromkeys(largest.tolist())  # a small data set is seen twice in a batch
+    write_dataset((dataset[position] for position in positions), folder, split="training")
     return folder
 
 
