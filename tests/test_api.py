@@ -262,6 +262,8 @@ def test_9_values_at_the_end_of_a_cell_are_short(data):
     assert repr(rollouts).endswith("agents × 80 steps, seed 7)")
     assert str(values[-1]).startswith("RMM 0.")
     assert repr(data).endswith("split 'validation', 2 scenarios)")
+    synthetic = rs.load_dataset("synthetic", "validation")
+    assert repr(synthetic) == "ScenarioDataset('synthetic', split 'validation', 40 scenarios)"
 
 
 def test_10_the_base_model_is_what_it_was_after_fine_tuning(base, data):

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from rlftsim import __version__
+from rlftsim.cli.completion import SCRIPT
 from rlftsim.cli.main import VERBS, main, parse
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.config import smart_demo
@@ -64,6 +65,20 @@ def test_the_overview_names_every_verb(line, expected, capsys):
 
 def test_the_version_is_printed(capsys):
     assert run(capsys, "--version") == (0, f"rlftsim {__version__}\n", "")
+
+
+def test_a_shell_completes_verbs_actions_flags_and_names_of_files(tmp_path):
+    (tmp_path / "rlftsim").write_text(f'#!/bin/sh\nexec {sys.executable} -m rlftsim "$@"\n')
+    (tmp_path / "rlftsim").chmod(0o755)
+    script = """
+        eval "$(rlftsim --completion bash)"
+        try() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _rlftsim; echo "${COMPREPLY[@]}"; }
+        try rlftsim eva; try rlftsim submit b; try rlftsim finetune smart-demo --finetune.kl.t; try rlftsim evaluate ru
+    """
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["evaluate", "build", "--finetune.kl.target", ""]
+    assert "\ncomplete -o default -F _rlftsim rlftsim\n" in SCRIPT  # nothing fits: names of files
 
 
 def test_a_misspelled_verb_is_guessed(capsys):

@@ -21,13 +21,16 @@ from rlftsim.verbs.commands import COMMANDS, VERBS
 JOIN = "join"
 DEBUG = "--debug"
 """Word of any command that shows an error with its traceback, not as one line."""
+COMPLETION = "--completion"
+"""Word that is followed by a shell, whose script is printed, or by the words that the script wants continued."""
 OVERVIEW = "\n".join(
     [
         f"rlftsim {__version__}: traffic agents that behave like real road users.\n",
         "usage: rlftsim VERB ...      rlftsim VERB --help explains a verb\n",
         *("\n" * verb.begins_group + f"  {name:12} {verb.summary}" for name, verb in VERBS.items()),
         f"\n  {JOIN} VERB .. put the shares of a command together that ran on several machines (--share K/N)\n"
-        f"\n  With {DEBUG} any command shows the traceback of an error.\n",
+        f"\n  With {DEBUG} any command shows the traceback of an error.\n"
+        f'  eval "$(rlftsim {COMPLETION} bash)", or zsh: the shell completes verbs and flags.\n',
     ]
 )
 SIGNALLED = 128
@@ -53,6 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"rlftsim {__version__}")
         return 0
     try:
+        if words[0] == COMPLETION:
+            from rlftsim.cli.completion import SCRIPT, list_next_words
+
+            print(SCRIPT if words[1:] in (["bash"], ["zsh"]) else "\n".join(list_next_words(words[1:])))
+            return 0
         call = parse(words)
         return call.show(call.command.function(**call.arguments))
     except RlftsimError as error:

@@ -246,7 +246,8 @@ class ScenarioDataset:
 
     def __repr__(self) -> str:
         split = "" if self.split is None else f", split {self.split!r}"
-        return f"ScenarioDataset({str(self.folder)!r}{split}, {len(self)} scenarios)"
+        name = SYNTHETIC if self.folder == pack_path() else str(self.folder)
+        return f"ScenarioDataset({name!r}{split}, {len(self)} scenarios)"
 
     def _label_clusters(self) -> Shaped[np.ndarray, "scenarios"]:
         """Labels of the scenarios in the index, see `clusters`."""

@@ -1,4 +1,4 @@
-"""Forecast of a training: the real command, stopped after a few updates, and again on the largest scenarios alone."""
+"""Forecast of a training: the real command, stopped after a few updates, and again on the run's largest batch alone."""
 
 import math
 import os
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Int64
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, shorten
@@ -20,7 +21,8 @@ from rlftsim.jobs.progress import log
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.open import open_dataset
-from rlftsim.training.parallel import scenario_costs
+from rlftsim.training.data import scenarios_of_update
+from rlftsim.training.parallel import balance_by_cost, scenario_costs
 from rlftsim.training.registry import method_by_name
 from rlftsim.training.run_folder import flatten, read_metrics, stored_settings
 from rlftsim.verbs.finetune import choose_method
@@ -30,6 +32,8 @@ WARM_UP = 1
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """Bytes that a container may use; "max" = no limit."""
 SECONDS_BETWEEN_LOOKS = 0.05
+MAX_LOOKED_AT = 100_000
+"""Scenarios of a run, from its start, among which the largest batch is looked for."""
 COUNTED = ("epochs", "batch_size", "num_scenarios", "held_back", "lengths")
 """Settings that the number of updates follows from, as far as a method has them."""
 
@@ -55,23 +59,25 @@ class TrainingCommand:
         words = self.write_words(self.data, Path())
         return "pretrain" if self.verb == "pretrain" else choose_method(recipe_by_name(self.recipe), words)
 
-    def write_words(self, data: str | Path, out: Path, micro_batch: int | None = None) -> list[str]:
+    def write_words(self, data: str | Path, out: Path, sizes: tuple[int, int] | None = None) -> list[str]:
         """Words of the command line.
 
         Args:
             data: Data set to train on.
             out: Folder of the run.
-            micro_batch: Scenarios in memory at once; None = as the settings say.
+            sizes: Processes, which few scenarios would not have, and scenarios in memory at once; None = as the
+                settings say.
         """
         words = [self.verb, self.recipe, "--data", str(data), "--out", str(out)]
         model_flag = "--model" if self.verb == "finetune" else "--init-from"
         flags = {"--vocabulary": self.vocabulary, "--config": self.config, "--method": self.method}
         for flag, value in {model_flag: self.model, **flags}.items():
             words += [flag, value] if value is not None else []
-        if micro_batch is None:
+        if sizes is None:
             return words
+        processes, micro_batch = sizes
         section = "finetune" if self.trainer == "rlft" else self.trainer
-        return [*words, f"--{section}.micro-batch-size", str(micro_batch)]
+        return [*words, "--processes", str(processes), f"--{section}.micro-batch-size", str(micro_batch)]
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class TrainingForecast:
     micro_batch: int
     """Scenarios in memory at once with the given settings, over all processes."""
     peak_bytes: int
-    """Of all processes, with the largest scenarios."""
+    """Of all processes, with the largest batch."""
     fitting_micro_batch: int
     """Largest one that fits, up to the batch; 0 = none."""
     available_bytes: int
@@ -121,24 +127,26 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
         run = measure_run(command.write_words(command.data, folder / "run"), folder / "run", WARM_UP + num_measured)
         batch_size, micro_batch = (int(str(run.settings[name])) for name in ("batch_size", "micro_batch_size"))
         processes = int(str(run.settings["device.processes"]))
-        log.info("measure the largest scenarios")
-        largest = write_largest(dataset, max(batch_size, 2), folder / "largest")  # calibration needs 2
+        counted: Any = {name: value for name, value in run.settings.items() if name in COUNTED}
+        if "lengths" in counted:  # JSON has lists alone
+            counted["lengths"] = tuple(counted["lengths"])
+        num_updates = method_by_name(command.trainer).settings(**counted).num_updates(len(dataset))
+        log.info("measure the largest batch")
+        seed = int(str(run.settings["seed"]))
+        order = np.array(scenarios_of_update(0, min(num_updates * batch_size, MAX_LOOKED_AT), len(dataset), seed))
+        largest = write_largest(dataset, order, batch_size, processes, folder / "largest")
         sizes = dict.fromkeys((min(micro_batch, batch_size), processes))
         peaks = {
-            size: processes * measure_run(command.write_words(largest, out, size), out, 1).peak_bytes
+            size: processes * measure_run(command.write_words(largest, out, (processes, size)), out, 1).peak_bytes
             for size, out in ((size, folder / f"micro-{size}") for size in sizes)
         }
     peak, lowest = peaks[min(micro_batch, batch_size)], peaks[processes]
     fitting = find_fitting_micro_batch(peaks, available, batch_size)
     if not fitting:
         raise DataError(
-            f"{command.verb} {command.recipe} cannot fit: at the least micro batch the largest scenarios need "
+            f"{command.verb} {command.recipe} cannot fit: at the least micro batch the largest batch needs "
             f"{lowest / 1e9:.1f} GB of this machine's {available / 1e9:.1f}: take fewer processes, or a smaller model."
         )
-    counted: Any = {name: value for name, value in run.settings.items() if name in COUNTED}
-    if "lengths" in counted:  # JSON has lists alone
-        counted["lengths"] = tuple(counted["lengths"])
-    num_updates = method_by_name(command.trainer).settings(**counted).num_updates(len(dataset))
     used = min(micro_batch, batch_size)
     return TrainingForecast(num_updates, run.seconds, num_measured, processes, used, peak, fitting, available)
 
@@ -181,16 +189,29 @@ def measure_run(words: list[str], out: Path, num_updates: int) -> MeasuredRun:
     return MeasuredRun(seconds, usage.ru_maxrss * 1024, flatten(stored_settings(out)))
 
 
-def write_largest(dataset: ScenarioDataset, count: int, folder: Path) -> Path:
-    """Write a data set of the largest scenarios, all of the split training. Returns its folder.
+def write_largest(
+    dataset: ScenarioDataset, order: Int64[np.ndarray, "n"], batch_size: int, processes: int, folder: Path
+) -> Path:
+    """Write a data set of the scenarios of the largest batch, all of the split training. Returns its folder.
+
+    In the largest, a process has most agents, padding included: its scenarios times the largest of these.
 
     Args:
         dataset: Scenarios to choose from.
-        count: Number of scenarios.
+        order: Positions of the scenarios in the order of the run, batch after batch.
+        batch_size: Scenarios of a batch; at least two are written, which a calibration needs.
+        processes: Number of processes that share a batch, each with about the same cost.
         folder: Folder to write.
     """
-    order = np.argsort(-scenario_costs(dataset), kind="stable")[:count]
-    write_dataset((dataset[int(position)] for position in order), folder, split="training")
+    size, costs, agents = max(batch_size, 2), scenario_costs(dataset), dataset.num_agents
+
+    def padded_agents(batch: Int64[np.ndarray, "size"]) -> int:
+        groups = [batch[group] for group in balance_by_cost(costs[batch], processes) if group]
+        return max(len(group) * int(agents[group].max()) for group in groups)
+
+    largest = max(np.resize(order, (max(len(order) // size, 1), size)), key=padded_agents)
+    positions = dict.fromkeys(largest.tolist())  # a small data set is seen twice in a batch
+    write_dataset((dataset[position] for position in positions), folder, split="training")
     return folder
 
 
@@ -236,6 +257,6 @@ def training_table(command: TrainingCommand, forecast: TrainingForecast) -> Tabl
     table.add_row("updates", str(forecast.num_updates))
     table.add_row("an update", f"{forecast.seconds:.3g} s (mean of {forecast.num_measured})")
     table.add_row("in all", f"{total:.0f} s" if total < 120 else f"{total / 60:.0f} min")
-    table.add_row("peak memory", f"{needed:.1f} GB of {available:.1f} GB, with the largest scenarios{fits}")
+    table.add_row("peak memory", f"{needed:.1f} GB of {available:.1f} GB, with the largest batch{fits}")
     table.add_row("micro batch", f"{forecast.micro_batch} now, up to {forecast.fitting_micro_batch} fit")
     return table

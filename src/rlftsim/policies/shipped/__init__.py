@@ -17,14 +17,14 @@ def demo_base() -> SmartPolicy:
 
 
 def demo_tuned() -> CalibratedPolicy:
-    """`demo_base` after MLOO that holds speed and a calibration: half of the collisions, as fast as before."""
+    """demo-base after MLOO that holds speed and a calibration: half of the collisions, as fast as before."""
     calibration = read_calibration(SHIPPED_MODELS / "demo-tuned" / CALIBRATION)
     features, eta = zip(*((row["feature"], row["eta"]) for row in calibration["features"]))
     return CalibratedPolicy(_with_changes(demo_base(), "demo-tuned"), features, eta, calibration)
 
 
 def demo_goals() -> SmartPolicy:
-    """`demo_base` with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
+    """demo-base with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
     return _with_changes(demo_base().with_goal_conditioning("indication", logit_bias=True), "demo-goals")
 
 
