@@ -11,6 +11,7 @@ import pytest
 import torch  # noqa: F401  help is compared with that of the real libraries
 
 from rlftsim.cli.main import VERBS, main
+from rlftsim.verbs.commands import COMMANDS
 
 OVERVIEW_SECONDS = 0.3
 WORD = re.compile(r"[\w.-]*\w")
@@ -69,3 +70,14 @@ def test_help_does_not_import_torch_and_is_the_help_with_torch(line, capsys, mon
     with contextlib.suppress(SystemExit):
         main(line)
     assert WORD.findall(done.stdout) == WORD.findall(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("line", ["evaluate", "experiment exam", "finetune"])
+def test_help_is_folded_to_the_terminal_without_breaking_a_word(line, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([*line.split(), "--help"])
+    printed = capsys.readouterr().out
+    assert [text for text in printed.splitlines() if len(text) > 80] == []
+    description = COMMANDS[line].function.__doc__.partition("\n\n")[0]
+    assert " ".join(description.split()) in " ".join(printed.split())

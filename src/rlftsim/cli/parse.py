@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 import shutil
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
@@ -91,7 +92,7 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
         return tyro.cli(parser, args=arguments, prog=f"rlftsim {name}")
 
     if any(word in HELP for word in words):
-        return read(complete)
+        _print_help(read, complete)
     # tyro prints a box of lines and exits; the box is caught and made one line.
     complaint = io.StringIO()
     try:
@@ -113,6 +114,20 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
     flag_values = {argument: value for argument, value in call.values.items() if argument not in command.sections}
     _check_values(flag_values, [*name.split(), *words])
     return finish_call(call, flags, list_flags(words)) if flags else call
+
+
+def _print_help(read: Any, words: list[str]) -> NoReturn:
+    """Print the help of a command. Its description, of which tyro makes a line for each paragraph, is folded."""
+    # tyro asks where the help goes to for colors and the characters of boxes
+    terminal = sys.stdout
+    text = type("Help", (io.StringIO,), {"isatty": lambda self: terminal.isatty(), "encoding": terminal.encoding})()
+    with redirect_stdout(text), suppress(SystemExit):
+        read(words)
+    columns = shutil.get_terminal_size().columns
+    for line in text.getvalue().splitlines():
+        is_sentence = line[:1].isupper()
+        print(textwrap.fill(line, columns) if is_sentence else line)
+    raise SystemExit(0)
 
 
 def _help_text(read: Any) -> str:
