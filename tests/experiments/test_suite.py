@@ -14,7 +14,7 @@ from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.evaluate import EvaluateConfig
-from rlftsim.experiments.demo import DemoConfig, run_demo
+from rlftsim.experiments.demo import DemoConfig, place_gain, run_demo
 from rlftsim.experiments.model_specs import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.paper import qualitative, variance_scaling
 from rlftsim.experiments.results import Experiment, ExperimentResult, run_experiment
@@ -298,8 +298,15 @@ def test_the_demo_runs_the_same_stages(data, tmp_path):
     assert page.count("Scenario c") + page.count("Scenario d") >= 1
     assert "Quick run: every stage at its smallest size. These numbers mean nothing" in page
     assert "RLFTSim demo: closed-loop fine-tuning of a traffic model" in page  # no claim
+    assert "expected gain" not in page
     assert {path.suffix for path in (tmp_path / "scenarios").iterdir()} == {".html", ".mp4"}
     assert (tmp_path / "picture.png").exists()
+
+
+@pytest.mark.parametrize(("gain", "position"), [(0.009, "below"), (0.0138, "inside"), (0.031, "above")])
+def test_the_demo_says_where_its_gain_lies_among_those_of_other_runs(gain, position):
+    text = f"RMM +0.0126 to +0.0292, by 15 runs on other streets; this run's +{gain:.4f} lies {position}"
+    assert place_gain(gain) == text
 
 
 def test_rows_of_methods_that_cannot_train_the_policy_are_left_out_before_anything_runs(done, data, tmp_path, capsys):
