@@ -3,7 +3,7 @@
 An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -20,12 +20,14 @@ from rlftsim.goals.types import Goals, logged_goals
 from rlftsim.jobs.items import group_positions, run_items
 from rlftsim.jobs.runner import Advance, Runner, check_jobs, choose_runner
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
-from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
+from rlftsim.realism.from_rollouts import logged_states, prepend_history, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
+from rlftsim.rollout.scene_draw import draw_scene
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenario
 
 Oracle = Literal["oracle"]
 
@@ -66,6 +68,8 @@ def evaluate(
     name = name or (title if is_oracle else f"{title}-{fingerprint[:8]}")
     if config.goals != "none" and not is_goal_conditioned(policy):
         raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
+    if config.goals != "none" and config.challenge.makes_scenes:
+        raise ConfigError(f"metric {config.metric} is of drawn agents, which have no logged goals: leave goals out.")
     # Everything that can be refused is refused before anything is simulated or written.
     dataset, config = open_held_out(data, config)
     ids = choose_scenarios(dataset, config)
@@ -148,12 +152,41 @@ def simulate_states(
             context=context, sampling=config.sampling, goals=goals,
         )  # fmt: skip
         passes.append(states_of_rollouts(batch, rollouts)[0])
-    x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
-    joined = SimulatedStates(passes[0].object_id, x, y, z, heading)  # each [N, A, T]
+    joined = _join_passes(passes)
     # The metric would count NaN in a last bin, as no collision and no way off the road: a better score for nothing.
     joined.check_finite(batch.scenarios[0].scenario_id)
     # Equal rollouts of a deterministic policy are counted by the metric as often as rollouts were wanted.
     return joined if is_random else replace(joined, repeat=config.num_rollouts)
+
+
+def _join_passes(passes: Sequence[SimulatedStates]) -> SimulatedStates:
+    """All rollouts of several passes, each [N, A, T]."""
+    x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
+    sizes = [p.size for p in passes if p.size is not None]
+    return SimulatedStates(passes[0].object_id, x, y, z, heading, size=torch.cat(sizes) if sizes else None)
+
+
+def generate_states(policy: Policy, scenario: Scenario, config: EvaluateConfig) -> SimulatedStates:
+    """Generated scenes: each rollout goes on from a history of its own, drawn by `draw_scene`.
+
+    Args:
+        policy: Policy of all agents.
+        scenario: Scenario with the map, the lights and the ego's past; no other logged state is read.
+        config: Number of rollouts, seed, sampling.
+
+    Raises:
+        DataError: A pose of the policy that is not finite.
+    """
+    scenes = []
+    for rollout in range(config.num_rollouts):
+        drawn = draw_scene(scenario, rollout, seed=config.seed)
+        batch = collate([drawn]).to(get_device(policy))
+        ids = range(rollout, rollout + 1)
+        rollouts = simulate(policy, batch, num_rollouts=ids, seed=config.seed, sampling=config.sampling)
+        scenes.append(prepend_history(drawn, states_of_rollouts(batch, rollouts)[0]))
+    joined = _join_passes(scenes)
+    joined.check_finite(scenario.scenario_id)
+    return joined
 
 
 def simulate_evaluated(policy: Policy | Oracle, batch: ScenarioBatch, config: EvaluateConfig) -> SimulatedStates:
@@ -161,15 +194,18 @@ def simulate_evaluated(policy: Policy | Oracle, batch: ScenarioBatch, config: Ev
 
     Args:
         policy: Policy of all agents, or "oracle" for the log.
-        batch: The scenario alone, with a logged future.
-        config: Number of rollouts, seed, sampling, goals.
+        batch: The scenario alone; for the log, with a future.
+        config: Metric, number of rollouts, seed, sampling, goals.
 
     Raises:
         ConfigError, DataError: See `simulate_states`.
     """
     device = get_device(policy)
     if isinstance(policy, str):
-        return logged_states(batch.scenarios[0], num_rollouts=config.num_rollouts, device=device)
+        scenario, count = batch.scenarios[0], config.num_rollouts
+        return logged_states(scenario, num_rollouts=count, device=device, challenge=config.challenge)
+    if config.challenge.makes_scenes:
+        return generate_states(policy, batch.scenarios[0], config)
     batch = batch.to(device)
     goals = logged_goals(batch, batch.evaluated_mask) if config.goals == "logged" else None
     return simulate_states(policy, batch, config, goals=goals)
@@ -201,7 +237,7 @@ def _evaluate_group(
             ) from None
         # Without a road edge, for instance, the official metric is undefined.
         try:
-            log = scenario_log(scenario, device)
+            log = scenario_log(scenario, device, challenge=config.challenge)
         except DataError as error:
             results.append(Skipped(scenario.scenario_id, str(error)))
         else:
