@@ -187,4 +187,4 @@ def test_an_evaluation_scores_scenes_and_takes_no_goals(tmp_path):
     assert np.isnan(drawn["miss_rate"]).all()
     assert (log["meta_metric"] > drawn["meta_metric"]).all()
     with pytest.raises(ConfigError, match="drawn agents, which have no logged goals"):
-        evaluate(load_policy("demo-base"), "synthetic", None, replace(config, goals="logged"), show_progress=False)
+        evaluate(load_policy("demo-goals"), "synthetic", None, replace(config, goals="logged"), show_progress=False)
