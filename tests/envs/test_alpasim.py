@@ -12,6 +12,7 @@ from rlftsim.envs import alpasim_service
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.policy import frozen_copy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
@@ -145,13 +146,27 @@ def start(client, scenario, uuid="a", **changes):
     return client.call("start_session", **(fields | changes))
 
 
-def put_ego_first(scenario):
-    """The same scenario with the ego as the first track, as a client lists it; a track for each simulated agent."""
+def as_sent(scenario):
+    """The scenario of what a client sends: ego first, gaps interpolated, velocities that follow from positions."""
     rows = [scenario.ego_index, *(row for row in scenario.simulated_indices if row != scenario.ego_index)]
-    order = np.array(rows)
+    tracks = scenario.tracks.select(np.array(rows)).cut(slice(11))
+    position, heading, velocity, valid = (
+        values.copy() for values in (tracks.position, tracks.heading, tracks.velocity, tracks.valid)
+    )
+    for row in range(len(rows)):
+        steps = np.flatnonzero(tracks.valid[row])
+        span = np.arange(steps[0], 11)
+        for axis in range(3):
+            position[row, span, axis] = np.interp(span, steps, tracks.position[row, steps, axis])
+        heading[row, span] = np.interp(span, steps, np.unwrap(tracks.heading[row, steps]))
+        valid[row, span] = True
+        if len(span) > 1:
+            velocity[row, span] = np.gradient(position[row, span, :2].astype(np.float64), 0.1, axis=0)
+    heading = (np.remainder(heading + np.pi, 2 * np.pi) - np.pi).astype(np.float32)
+    size = np.repeat(tracks.size[:, 10:], 11, 1)
     return replace(
-        scenario, tracks=scenario.tracks.select(order), ego_index=0, tracks_to_predict=np.zeros(0, np.int32),
-        difficulty=np.zeros(0, np.int8),
+        without_future(scenario), ego_index=0, tracks_to_predict=np.zeros(0, np.int32), difficulty=np.zeros(0, np.int8),
+        tracks=replace(tracks, position=position, heading=heading, velocity=velocity, valid=valid, size=size),
     )  # fmt: skip
 
 
@@ -186,7 +201,7 @@ def test_twenty_scenarios_are_driven_as_simulate_drives_them(data):
     server, client, service = serve(policy, data)
     worst = 0.0
     for scenario in data[:20]:
-        batch = collate([put_ego_first(scenario)])
+        batch = collate([as_sent(scenario)])
         rollouts = simulate(policy, batch, num_rollouts=1, seed=SEED)
         expected = (
             torch.cat([batch.to_world(rollouts.position), rollouts.heading[..., None]], -1)[0, 0].double().numpy()

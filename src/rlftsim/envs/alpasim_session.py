@@ -70,6 +70,18 @@ class Path(NamedTuple):
         """Poses at some times, interpolated; before the first and after the last pose these hold."""
         return np.stack([np.interp(time_us, self.time_us, column) for column in self.pose.T], -1)
 
+    def velocity_at(self, time_us: Int64[np.ndarray, "m"], end_us: int) -> Float[np.ndarray, "m 2"]:
+        """Mean velocities from a step before some times to a step after, as far as there are poses, m/s.
+
+        Args:
+            time_us: Times of the velocities.
+            end_us: Time after which no pose is read.
+        """
+        first, last = self.time_us[0], min(self.time_us[-1], end_us)
+        before, after = (np.clip(time_us + shift, first, max(first, last)) for shift in (-STEP_US, STEP_US))
+        span_s = np.maximum(after - before, 1)[:, None] / 1e6
+        return (self.at(after) - self.at(before))[:, :2] / span_s
+
     def covers(self, time_us: int) -> bool:
         """True at times from the first to the last pose."""
         return bool(self.time_us[0] <= time_us <= self.time_us[-1])
@@ -153,6 +165,7 @@ def build_session_scenario(
     """
     times = handover_us + STEP_US * np.arange(-CURRENT_STEP, 1)
     pose = np.stack([logged.path.at(times) for logged in objects])  # [A, 11, 4]
+    velocity = np.stack([logged.path.velocity_at(times, handover_us) for logged in objects])
     valid = np.stack([[logged.is_static or logged.path.covers(time) for time in times] for logged in objects])
     size = np.array([logged.size for logged in objects], np.float32)
     count = len(objects)
@@ -161,7 +174,7 @@ def build_session_scenario(
         object_type=np.array([logged.object_type for logged in objects], np.int8),
         position=pose[..., :3].astype(np.float32),
         heading=wrapped(pose[..., 3]).astype(np.float32),
-        velocity=np.gradient(pose[..., :2], STEP_S, axis=1).astype(np.float32),
+        velocity=velocity.astype(np.float32),
         size=np.repeat(size[:, None], HISTORY_STEPS, 1),
         valid=valid,
     )
