@@ -178,12 +178,12 @@ def generate_states(policy: Policy, scenario: Scenario, config: EvaluateConfig) 
         DataError: A pose of the policy that is not finite.
     """
     scenes = []
-    for rollout in range(config.num_rollouts):
-        drawn = draw_scene(scenario, rollout, seed=config.seed)
-        batch = collate([drawn]).to(get_device(policy))
-        ids = range(rollout, rollout + 1)
-        rollouts = simulate(policy, batch, num_rollouts=ids, seed=config.seed, sampling=config.sampling)
-        scenes.append(prepend_history(drawn, states_of_rollouts(batch, rollouts)[0]))
+    for first in range(0, config.num_rollouts, config.rollouts_per_pass):
+        numbers = range(first, min(first + config.rollouts_per_pass, config.num_rollouts))
+        drawn = [draw_scene(scenario, rollout, seed=config.seed) for rollout in numbers]
+        batch = collate(drawn).to(get_device(policy))
+        rollouts = simulate(policy, batch, num_rollouts=1, seed=config.seed, sampling=config.sampling)
+        scenes += map(prepend_history, drawn, states_of_rollouts(batch, rollouts))
     joined = _join_passes(scenes)
     joined.check_finite(scenario.scenario_id)
     return joined

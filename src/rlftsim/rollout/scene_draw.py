@@ -37,7 +37,7 @@ MAX_DRAWS = 30
 
 
 def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
-    """The scenario without its future, with drawn histories of all simulated agents but the ego.
+    """The scenario without its future, named after the rollout, with drawn histories of all agents but the ego.
 
     Args:
         scenario: Scenario whose map, lights up to the current step, ego's past, object ids and types are read.
@@ -85,7 +85,8 @@ def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
     )
     nothing = scenario.tracks_to_predict[:0], scenario.difficulty[:0], scenario.objects_of_interest[:0]
     names = ("tracks_to_predict", "difficulty", "objects_of_interest")
-    return replace(history, tracks=drawn, ego_index=ego, **dict(zip(names, nothing)))
+    name = f"{scenario.scenario_id}-{rollout}"  # so that the policy's dice differ, too
+    return replace(history, scenario_id=name, tracks=drawn, ego_index=ego, **dict(zip(names, nothing)))
 
 
 def _draw_history(
