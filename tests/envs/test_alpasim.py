@@ -1,21 +1,21 @@
 """AlpaSim's traffic service, spoken with by a client of its own: messages by their published field numbers."""
 
+import sys
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from rlftsim.envs import alpasim_service
+from rlftsim.envs.world import Dice, begin, build_world, step_world
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.policy import frozen_copy
-from rlftsim.rollout.simulate import simulate
-from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.verbs.serve import serve_alpasim
 
@@ -160,6 +160,7 @@ def as_sent(scenario):
             position[row, span, axis] = np.interp(span, steps, tracks.position[row, steps, axis])
         heading[row, span] = np.interp(span, steps, np.unwrap(tracks.heading[row, steps]))
         valid[row, span] = True
+        velocity[row, span] = 0.0
         if len(span) > 1:
             velocity[row, span] = np.gradient(position[row, span, :2].astype(np.float64), 0.1, axis=0)
     heading = (np.remainder(heading + np.pi, 2 * np.pi) - np.pi).astype(np.float32)
@@ -171,7 +172,7 @@ def as_sent(scenario):
 
 
 def drive(client, scenario, uuid="a", steps=range(1, 81), query=lambda step: HANDOVER_US + step * 100_000):
-    """Answers of a session in which the ego goes where `simulate` lets it go."""
+    """Answers of a session in which the ego goes where a path says."""
     answers = []
     for step in steps:
         xyz, heading = scenario.ego_path[step]
@@ -195,26 +196,31 @@ def difference(first, second):
     return max(np.abs(first[..., :2] - second[..., :2]).max(), np.abs(turn).max())
 
 
+def drive_world(policy, scenario, path):
+    """x, y, heading [A, 80, 3] of the world of `rlftsim drive`, in which the ego goes along a path."""
+    world = build_world([scenario], policy, rules={"ego": "planner"})
+    state = begin(world, [Dice(SEED)])
+    for step in range(1, 81):
+        (x, y, _), heading = path.ego_path[step]
+        before = state.motion[0, 0, :2]
+        position = np.array([x, y]) - scenario.origin
+        velocity = (position - before) / 0.1
+        state = step_world(world, state, np.array([[*position, heading, *velocity]]))
+    motion = np.stack(state.track[11:], 2)[0, :, :, :3]
+    return motion + np.append(scenario.origin, 0.0)
+
+
 @pytest.mark.slow
-def test_twenty_scenarios_are_driven_as_simulate_drives_them(data):
-    policy = load_policy("demo-base")
+def test_twenty_scenarios_are_driven_as_rlftsim_drive_drives_them(data):
+    policy = frozen_copy(load_policy("demo-base"))
     server, client, service = serve(policy, data)
-    worst = 0.0
     for scenario in data[:20]:
-        batch = collate([as_sent(scenario)])
-        rollouts = simulate(policy, batch, num_rollouts=1, seed=SEED)
-        expected = (
-            torch.cat([batch.to_world(rollouts.position), rollouts.heading[..., None]], -1)[0, 0].double().numpy()
-        )
-        z = scenario.tracks.position[scenario.ego_index, 10, 2]
-        path = {step: ((x, y, z), heading) for step, (x, y, heading) in enumerate(expected[0], 1)}
         start(client, scenario)
-        answers = drive(client, Driven(path))
-        simulated = np.stack([read(answer) for answer in answers], 1)
-        worst = max(worst, difference(simulated, expected[1:]))
+        path = straight_on(scenario)
+        simulated = np.stack([read(answer) for answer in drive(client, path)], 1)
+        assert difference(simulated, drive_world(policy, as_sent(scenario), path)[1:]) <= 1e-3, scenario.scenario_id
         client.call("close_session", session_uuid="a")
     server.stop(None).wait()
-    assert worst <= 1e-3
     assert not service.sessions
 
 
@@ -386,3 +392,12 @@ def test_a_model_without_maps_is_refused_and_a_port_that_is_taken(served):
         serve_alpasim()
     with pytest.raises(ConfigError, match="cannot be listened on"):
         alpasim_service.start_server(served[1], host="203.0.113.7", port=1)
+
+
+def test_nothing_but_the_service_imports_grpcio_and_its_lack_is_one_line(served, monkeypatch):
+    package = Path(alpasim_service.__file__).parents[1]
+    importing = [path.name for path in package.rglob("*.py") if "import grpc" in path.read_text()]
+    assert importing == ["alpasim_service.py"]
+    monkeypatch.setitem(sys.modules, "grpc", None)
+    with pytest.raises(ConfigError, match=r"needs grpcio: pip install 'rlftsim\[alpasim\]'"):
+        alpasim_service.start_server(served[1], host="127.0.0.1", port=0)

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -82,9 +82,9 @@ class Path(NamedTuple):
         span_s = np.maximum(after - before, 1)[:, None] / 1e6
         return (self.at(after) - self.at(before))[:, :2] / span_s
 
-    def covers(self, time_us: int) -> bool:
-        """True at times from the first to the last pose."""
-        return bool(self.time_us[0] <= time_us <= self.time_us[-1])
+    def covers(self, time_us: Int64[np.ndarray, "m"] | int) -> Any:
+        """True at times from the first to the last pose, for one time or each of several."""
+        return (self.time_us[0] <= time_us) & (time_us <= self.time_us[-1])
 
 
 def read_path(trajectory: alpasim_pb2.Trajectory, object_id: str) -> Path:
@@ -164,9 +164,10 @@ def build_session_scenario(
         handover_us: Time of the current step.
     """
     times = handover_us + STEP_US * np.arange(-CURRENT_STEP, 1)
+    is_static = np.array([logged.is_static for logged in objects])
     pose = np.stack([logged.path.at(times) for logged in objects])  # [A, 11, 4]
     velocity = np.stack([logged.path.velocity_at(times, handover_us) for logged in objects])
-    valid = np.stack([[logged.is_static or logged.path.covers(time) for time in times] for logged in objects])
+    is_covered = np.stack([logged.path.covers(times) for logged in objects])  # [A, 11]
     size = np.array([logged.size for logged in objects], np.float32)
     count = len(objects)
     tracks = Tracks(
@@ -176,7 +177,7 @@ def build_session_scenario(
         heading=wrapped(pose[..., 3]).astype(np.float32),
         velocity=velocity.astype(np.float32),
         size=np.repeat(size[:, None], HISTORY_STEPS, 1),
-        valid=valid,
+        valid=is_covered | is_static[:, None],
     )
     lights = LightStates.of([])
     if scene is not None:

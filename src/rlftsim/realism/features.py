@@ -325,11 +325,12 @@ def _compute_interaction(
     num_neighbors = len(agents.object_id) if neighbors is None else neighbors.shape[1]
     chunk_size = max(1, max_pairs // (num_neighbors * len(agents.evaluated) * num_steps))
     log_valid = agents.valid[None, :, -num_steps:] if masks_log else None  # [1, A, T]
-    length, width, _ = size.expand(len(speed), -1, -1, -1).unbind(-1)
+    size = size.expand(len(speed), -1, -1, -1)
     distances, seconds = [], []
-    arrays = (future.x, future.y, future.heading, length, width, speed)
-    for *chunk, chunk_speed in zip(*(values.split(chunk_size) for values in arrays)):
-        boxes = PlanarAgents(*chunk, agents.evaluated, log_valid, neighbors, mask)
+    arrays = (future.x, future.y, future.heading, size, speed)
+    for x, y, heading, box_size, chunk_speed in zip(*(values.split(chunk_size) for values in arrays)):
+        length, width, _ = box_size.unbind(-1)
+        boxes = PlanarAgents(x, y, heading, length, width, agents.evaluated, log_valid, neighbors, mask)
         distances.append(compute_distance_to_nearest_object(boxes))
         seconds.append(compute_time_to_collision(boxes, chunk_speed))
     return torch.cat(distances), torch.cat(seconds)

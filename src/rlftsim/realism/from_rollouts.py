@@ -59,8 +59,8 @@ def prepend_history(scenario: Scenario, states: SimulatedStates) -> SimulatedSta
     future = (states.x, states.y, states.z, states.heading)
     size = torch.from_numpy(tracks.size[simulated, CURRENT_STEP, None]).to(states.device)  # [A, 1, 3]
     size = size.expand(num_rollouts, -1, TOTAL_STEPS, -1)
-    joined = (torch.cat(pair, -1) for pair in zip(columns, future))
-    return SimulatedStates(states.object_id, *joined, size=size)
+    x, y, z, heading = (torch.cat(pair, -1) for pair in zip(columns, future))
+    return SimulatedStates(states.object_id, x, y, z, heading, size=size)
 
 
 def logged_states(

@@ -60,7 +60,7 @@ def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
     distance = np.linalg.norm(graph.points[:, :2] - current[:2], axis=-1)
     candidates = np.flatnonzero(distance <= REACH_M)
     present = [ego]
-    for agent in np.flatnonzero(np.arange(len(agents)) != ego):
+    for agent in (row for row in range(len(agents)) if row != ego):
         for _ in range(MAX_DRAWS):
             if len(candidates):
                 states[agent] = _draw_history(graph, int(rng.choice(candidates)), types[agent], rng)
