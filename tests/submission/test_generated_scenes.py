@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rlftsim.errors import ConfigError
-from rlftsim.evaluation.evaluate import evaluate, generate_states
+from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.evaluation.rollout_states import generate_states
 from rlftsim.evaluation.submission_pb2 import ScenarioRollouts
 from rlftsim.geometry import boxes_overlap
 from rlftsim.policies.registry import load_policy

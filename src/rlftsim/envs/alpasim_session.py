@@ -77,10 +77,11 @@ class Path(NamedTuple):
             time_us: Times of the velocities.
             end_us: Time after which no pose is read.
         """
-        first, last = self.time_us[0], min(self.time_us[-1], end_us)
-        before, after = (np.clip(time_us + shift, first, max(first, last)) for shift in (-STEP_US, STEP_US))
-        span_s = np.maximum(after - before, 1)[:, None] / 1e6
-        return (self.at(after) - self.at(before))[:, :2] / span_s
+        first_us = self.time_us[0]
+        last_us = max(first_us, min(self.time_us[-1], end_us))
+        span_start, span_end = (np.clip(time_us + shift, first_us, last_us) for shift in (-STEP_US, STEP_US))
+        span_s = np.maximum(span_end - span_start, 1)[:, None] / 1e6
+        return (self.at(span_end) - self.at(span_start))[:, :2] / span_s
 
     def covers(self, time_us: Int64[np.ndarray, "m"] | int) -> Any:
         """True at times from the first to the last pose, for one time or each of several."""
@@ -181,9 +182,9 @@ def build_session_scenario(
     )
     lights = LightStates.of([])
     if scene is not None:
-        seen = scene.lights.step < HISTORY_STEPS
+        is_past = scene.lights.step < HISTORY_STEPS
         names = ("step", "lane_id", "state", "stop_point")
-        lights = LightStates(*(getattr(scene.lights, name)[seen] for name in names))
+        lights = LightStates(*(getattr(scene.lights, name)[is_past] for name in names))
     return Scenario(
         scenario_id=scene_id,
         timestamps_s=STEP_S * np.arange(HISTORY_STEPS),
@@ -230,7 +231,7 @@ class Session:
         self.world = build_world([scenario], policy, rules={"ego": "planner", **rules})
         self.state = begin(self.world, [Dice(request.random_seed)])
         """At the last step whose time the ego's poses reach."""
-        self.ahead: WorldState | None = None
+        self.next_state: WorldState | None = None
         """One step later, but for the ego, whose pose then is not known yet."""
         self.lock = threading.Lock()
 
@@ -238,8 +239,8 @@ class Session:
         """The ego's log up to the handover: what comes later is the client's to say."""
         path = next(logged.path for logged in self.objects if logged.object_id == EGO)
         is_past = path.time_us < self.handover_us
-        now = path.at(np.array([self.handover_us]))
-        return Path(np.append(path.time_us[is_past], self.handover_us), np.concatenate([path.pose[is_past], now]))
+        current = path.at(np.array([self.handover_us]))
+        return Path(np.append(path.time_us[is_past], self.handover_us), np.concatenate([path.pose[is_past], current]))
 
     def simulate(self, query_us: int, updates: Iterable[alpasim_pb2.ObjectUpdate]) -> list[tuple[str, Path]]:
         """Pose of each object but the ego at a time, and the poses after it that are decided already.
@@ -277,19 +278,19 @@ class Session:
         """Step the world to the last step before the query, and decide what follows."""
         while self.state.step < FUTURE_STEPS:
             time_us = self.handover_us + (self.state.step + 1) * STEP_US
-            if self.ahead is None:
-                self.ahead = step_world(self.world, self.state, self.state.motion[0, [self.ego]])
+            if self.next_state is None:
+                self.next_state = step_world(self.world, self.state, self.state.motion[0, [self.ego]])
             if time_us > query_us:
                 return
-            motion = self.ahead.motion.copy()
+            motion = self.next_state.motion.copy()
             motion[0, self.ego] = self._move_ego(time_us)
-            self.state, self.ahead = replace(self.ahead, track=(*self.ahead.track[:-1], motion)), None
+            self.state, self.next_state = replace(self.next_state, track=(*self.next_state.track[:-1], motion)), None
 
     def _move_ego(self, time_us: int) -> Float[np.ndarray, "5"]:
         """Motion of the ego at a time, map frame."""
-        before, now = self.ego_path.at(np.array([time_us - STEP_US, time_us]))
-        velocity = (now[:2] - before[:2]) / STEP_S
-        return np.concatenate([now[:2] - self.world.scenes[0].scenario.origin, [wrapped(now[3])], velocity])
+        previous, current = self.ego_path.at(np.array([time_us - STEP_US, time_us]))
+        velocity = (current[:2] - previous[:2]) / STEP_S
+        return np.concatenate([current[:2] - self.world.scenes[0].scenario.origin, [wrapped(current[3])], velocity])
 
     def _collect_paths(self, query_us: int) -> Iterable[tuple[str, Path | None]]:
         """Path of each object from the query on; None for an object without a pose then."""
@@ -311,13 +312,13 @@ class Session:
     def _collect_poses(self, query_us: int) -> tuple[Int64[np.ndarray, "m"], Float[np.ndarray, "A m 4"]]:
         """Poses of all agents at the query and at the steps after it that are decided."""
         track, z = [m[0, :, :3] for m in self.state.track[CURRENT_STEP:]], [h[0] for h in self.state.z[CURRENT_STEP:]]
-        if self.ahead is not None:
-            assert self.ahead.block is not None
-            assert self.ahead.block.poses is not None
-            decided = self.ahead.block.poses[0]  # [A, k, 3]
-            num_taken = self.state.step % decided.shape[1]
-            track += list(np.moveaxis(decided[:, num_taken:], 1, 0))
-            z += [self.ahead.z[-1][0]] * (decided.shape[1] - num_taken)
+        if self.next_state is not None:
+            assert self.next_state.block is not None
+            assert self.next_state.block.poses is not None
+            decided = self.next_state.block.poses[0]  # [A, k, 3]
+            num_past = self.state.step % decided.shape[1]
+            track += list(np.moveaxis(decided[:, num_past:], 1, 0))
+            z += [self.next_state.z[-1][0]] * (decided.shape[1] - num_past)
         motion, height = np.stack(track, 1), np.stack(z, 1)  # [A, steps, ...]
         position = motion[..., :2] + self.world.scenes[0].scenario.origin
         heading = np.unwrap(motion[..., 2], axis=1)

@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import simulate_evaluated
 from rlftsim.evaluation.explain import explain
 from rlftsim.evaluation.explain_page import explanation_html, write_files
 from rlftsim.evaluation.exporters import animate_states
 from rlftsim.evaluation.results import Evaluation
+from rlftsim.evaluation.rollout_states import simulate_evaluated
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.runner import check_jobs, choose_runner

@@ -6,7 +6,6 @@
 
 from rlftsim.realism.agents import SimulatedStates
 from rlftsim.realism.config import (
-    CHALLENGES,
     FEATURE_NAMES,
     METRIC_2023,
     METRIC_2024,
@@ -34,7 +33,7 @@ from rlftsim.realism.meta_metric import (
 )
 
 __all__ = [
-    "CHALLENGES", "FEATURE_NAMES", "METRICS", "METRIC_2023", "METRIC_2024", "METRIC_2024_ORIGINAL", "METRIC_2025",
+    "FEATURE_NAMES", "METRICS", "METRIC_2023", "METRIC_2024", "METRIC_2024_ORIGINAL", "METRIC_2025",
     "METRIC_2025_SCENARIO_GEN", "SCENARIO_GEN", "SIM_AGENTS", "AgentScores", "Challenge", "ComputeConfig", "Credit",
     "Features", "MetricConfig", "RealismResult", "ScenarioFeatures", "ScenarioLog", "SimulatedStates",
     "compute_batch_features", "compute_credit", "compute_features", "compute_single_credit", "metric_by_name",

@@ -69,7 +69,6 @@ class Challenge:
 
 SIM_AGENTS = Challenge("sim-agents", "Sim Agents", HISTORY_STEPS)
 SCENARIO_GEN = Challenge("scenario-gen", "Scenario Generation", 0)
-CHALLENGES = {challenge.name: challenge for challenge in (SIM_AGENTS, SCENARIO_GEN)}
 
 
 @dataclass(frozen=True)

@@ -68,14 +68,14 @@ def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
                 offset = rng.uniform(-1, 1, 4) * (REACH_M, REACH_M, 0, np.pi)
                 states[agent] = current + offset
             states[agent, :, 2] += size[agent, 2] / 2
-            pose, others = states[agent, CURRENT_STEP], states[present, CURRENT_STEP]
-            gap = others[:, :2] - pose[:2]
-            if not boxes_overlap(gap, pose[3], others[:, 3], size[agent], size[present]).any():
+            pose, neighbors = states[agent, CURRENT_STEP], states[present, CURRENT_STEP]
+            gap = neighbors[:, :2] - pose[:2]
+            if not boxes_overlap(gap, pose[3], neighbors[:, 3], size[agent], size[present]).any():
                 break
         present.append(agent)
     position = states[..., :3].astype(np.float32)
     velocity = np.gradient(states[..., :2], STEP_S, axis=1).astype(np.float32)
-    drawn = replace(
+    drawn_tracks = replace(
         tracks,
         position=position,
         heading=states[..., 3].astype(np.float32),
@@ -83,10 +83,10 @@ def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
         size=np.repeat(size[:, None], HISTORY_STEPS, 1).astype(np.float32),
         valid=np.ones(position.shape[:2], bool),
     )
-    nothing = scenario.tracks_to_predict[:0], scenario.difficulty[:0], scenario.objects_of_interest[:0]
     names = ("tracks_to_predict", "difficulty", "objects_of_interest")
+    cleared = {name: getattr(scenario, name)[:0] for name in names}
     name = f"{scenario.scenario_id}-{rollout}"  # so that the policy's dice differ, too
-    return replace(history, scenario_id=name, tracks=drawn, ego_index=ego, **dict(zip(names, nothing)))
+    return replace(history, scenario_id=name, tracks=drawn_tracks, ego_index=ego, **cleared)
 
 
 def _draw_history(
@@ -95,15 +95,15 @@ def _draw_history(
     """x, y, z on the ground and heading over the history, along the lane of a point where the history ends."""
     lane = graph.owner[point]
     first, line = graph.first[lane], graph.lines[lane]
-    along, heading = arc_length(line), np.unwrap(graph.heading[first : first + len(line)])
-    end = along[point - first]
+    distance, heading = arc_length(line), np.unwrap(graph.heading[first : first + len(line)])
+    end = distance[point - first]
     fastest = FASTEST_MPS.get(object_type, 0.0)
     if object_type == ObjectType.VEHICLE and graph.speed_limit_mps[lane] > 0:
         fastest = graph.speed_limit_mps[lane]
     # no farther than from the start of the lane
     speed = 0.0 if rng.random() < STANDING else min(rng.uniform(0, fastest), end / (CURRENT_STEP * STEP_S))
     at = end - speed * STEP_S * np.arange(CURRENT_STEP, -1, -1)
-    x, y, z, heading = (np.interp(at, along, values) for values in (*line.T, heading))
+    x, y, z, heading = (np.interp(at, distance, values) for values in (*line.T, heading))
     if object_type == ObjectType.PEDESTRIAN:
         side = rng.choice((-1, 1)) * rng.uniform(*SIDE_M)
         x, y = x - np.sin(heading) * side, y + np.cos(heading) * side

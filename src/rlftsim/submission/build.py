@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim.errors import DataError
-from rlftsim.evaluation.evaluate import simulate_evaluated
+from rlftsim.evaluation.rollout_states import simulate_evaluated
 from rlftsim.jobs.files import errors_name, remove_folder, remove_temporaries, temporary_path, write_text
 from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.items import ResultFormat, run_items

@@ -25,7 +25,7 @@ from rlftsim.realism import (
     METRIC_2025,
     METRIC_2025_SCENARIO_GEN,
     SIM_AGENTS,
-    Challenge,
+    MetricConfig,
     SimulatedStates,
     metric_by_name,
     score,
@@ -38,8 +38,8 @@ from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
 BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}
 """RMM on the test split with the weights of 2025, no traffic light term; from the table of RLFTSim (CVPR 2026)."""
-BOARD_METRICS = {metric.challenge: metric for metric in (METRIC_2025, METRIC_2025_SCENARIO_GEN)}
-"""Metric of each challenge's leaderboard."""
+BOARD_METRICS = {metric.challenge.name: metric for metric in (METRIC_2025, METRIC_2025_SCENARIO_GEN)}
+"""Metric of each challenge's leaderboard, by the challenge's name."""
 SERVER_ERRORS = """If the server answers with an error and no reason, or not for days, nothing in the file has to be
 wrong: entries wait up to several days, and others have met unexplained errors. Open an issue at
 waymo-research/waymo-open-dataset with the submission key that the page shows, the size and the SHA-256 above, and this
@@ -227,18 +227,18 @@ class ArchiveScores:
 
     Args:
         data: Scenarios of the archive's split.
-        challenge: Challenge that the archive is for.
+        metric: Metric of the challenge that the archive is for.
 
     Raises:
         DataError: Scenarios without a logged future.
     """
 
-    def __init__(self, data: ScenarioDataset, challenge: Challenge = SIM_AGENTS) -> None:
+    def __init__(self, data: ScenarioDataset, metric: MetricConfig = METRIC_2025) -> None:
         try:
             choose_scenarios(data, EvaluateConfig(split=data.split))
         except DataError as error:
             raise DataError(f"--score is for the validation split: {error}") from None
-        self._data, self._metric = data, BOARD_METRICS[challenge]
+        self._data, self._metric = data, metric
         self._rows: list[dict[str, object]] = []
         self._skipped: list[Skipped] = []
 

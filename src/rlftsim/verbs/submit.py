@@ -10,7 +10,6 @@ from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import print_line, print_lines, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import load_policy
-from rlftsim.realism import CHALLENGES
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.archive import split_file
 from rlftsim.submission.build import build_archive, delete_shards
@@ -98,7 +97,7 @@ def build(
     policy = load_policy(model, device)
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
     settings = EvaluateConfig(
-        metric=BOARD_METRICS[CHALLENGES[challenge]].name, seed=seed, temperature=temperature, top_k=top_k, split=split,
+        metric=BOARD_METRICS[challenge].name, seed=seed, temperature=temperature, top_k=top_k, split=split,
         rollouts_per_pass=rollouts_per_pass, jobs=jobs,
     )  # fmt: skip
     job = prepare_job(
@@ -159,10 +158,15 @@ def check(
     if json is not None:
         check_file(json)
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
-    rules = CHALLENGES[challenge]
-    scores = ArchiveScores(dataset, rules) if score else None
+    metric = BOARD_METRICS[challenge]
+    scores = ArchiveScores(dataset, metric) if score else None
     result = check_archive(
-        archive, dataset, sample=sample, expected_sha256=reported_sha256(archive), challenge=rules, callback=scores
+        archive,
+        dataset,
+        sample=sample,
+        expected_sha256=reported_sha256(archive),
+        challenge=metric.challenge,
+        callback=scores,
     )
     _print_findings(result)
     if json is not None:
