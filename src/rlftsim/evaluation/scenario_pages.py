@@ -37,8 +37,9 @@ class EvaluatedModels:
 
     @property
     def can_simulate(self) -> bool:
-        """True if scenarios and at least one model are at hand."""
-        return bool(self.policies) and self.dataset is not None
+        """True if scenarios and at least one model are at hand, and agents go on from the log, as pages show them."""
+        makes_scenes = any(evaluation.config.challenge.makes_scenes for evaluation in self.evaluations)
+        return bool(self.policies) and self.dataset is not None and not makes_scenes
 
     def animate(self, scenario_id: str, caption: str = "") -> Animation:
         """The log beside the first rollouts of each model at hand.
