@@ -1,7 +1,9 @@
 """AlpaSim's traffic service, spoken with by a client of its own: messages by their published field numbers."""
 
+import gc
 import sys
 import threading
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -385,6 +387,18 @@ def test_a_session_closed_during_a_call_ends_it_as_it_would(served, data):
     thread.join()
     assert len(answers[0].object_trajectory_updates) == len(list_objects(data[0])) - 1
     assert client.fails("close_session", session_uuid="c") == "NOT_FOUND"
+
+
+def test_a_closed_session_leaves_nothing_behind(served, data):
+    client, service = served
+    start(client, data[0], "gone")
+    drive(client, straight_on(data[0]), "gone", [5])
+    session = service.sessions["gone"]
+    left = [weakref.ref(value) for value in (session, session.world, session.world.scenes[0].scenario)]
+    del session
+    client.call("close_session", session_uuid="gone")
+    gc.collect()
+    assert [reference() for reference in left] == [None] * 3
 
 
 def test_a_model_without_maps_is_refused_and_a_port_that_is_taken(served):

@@ -40,7 +40,7 @@ class TrafficService:
         """Begin a session.
 
         Raises:
-            RequestError: A request that lacks something, an unknown scene, or an id that is taken.
+            RequestError: An incomplete request, an unknown scene, or an id that is taken.
         """
         for name in ("session_uuid", "scene_id", "logged_object_trajectories"):
             if not getattr(request, name):
@@ -67,7 +67,7 @@ class TrafficService:
         return answer
 
     def close_session(self, request: alpasim_pb2.CloseRequest) -> alpasim_pb2.Empty:
-        """Forget a session; calls that are under way end as they would.
+        """Forget a session; calls that are under way end as usual.
 
         Raises:
             RequestError: An unknown session.

@@ -1,8 +1,8 @@
-"""A session of AlpaSim's traffic service: its objects as agents of a world, and their poses at any time.
+"""A session of AlpaSim's traffic service: objects as agents of a world, and poses at any time.
 
 Up to the handover objects replay the poses that the client sent. From there on the world steps every 0.1 s, as `rlftsim
-drive` does: the client moves the ego, the policy all other agents, and poses between two steps are interpolated. Needs
-no grpcio: `alpasim_service` speaks it.
+drive` does: the client moves the ego, the policy all other agents, and poses between two steps are interpolated. The
+protocol is in `alpasim_service`.
 """
 
 import threading
@@ -200,7 +200,7 @@ def build_session_scenario(
 
 
 class Session:
-    """State of a session; calls of several threads wait for one another.
+    """State of a session; a call waits until earlier calls have ended.
 
     Args:
         request: Objects, seed and handover.
@@ -208,7 +208,7 @@ class Session:
         policy: Traffic model.
 
     Raises:
-        RequestError: Objects, or a handover, that are none; a scene without lanes for a model that needs them.
+        RequestError: Impossible objects or handover, or a scene without a map for a model with maps.
     """
 
     def __init__(self, request: alpasim_pb2.SessionRequest, scene: Scenario | None, policy: Policy) -> None:
@@ -236,7 +236,7 @@ class Session:
         self.lock = threading.Lock()
 
     def _cut_ego_path(self) -> Path:
-        """The ego's log up to the handover: what comes later is the client's to say."""
+        """The ego's log up to the handover: later poses are the client's to say."""
         path = next(logged.path for logged in self.objects if logged.object_id == EGO)
         is_past = path.time_us < self.handover_us
         current = path.at(np.array([self.handover_us]))
@@ -275,7 +275,7 @@ class Session:
         self.ego_path = Path(np.append(self.ego_path.time_us, update.time_us[is_new]), joined)
 
     def _advance(self, query_us: int) -> None:
-        """Step the world to the last step before the query, and decide what follows."""
+        """Step the world to the last step before the query, and decide the next steps."""
         while self.state.step < FUTURE_STEPS:
             time_us = self.handover_us + (self.state.step + 1) * STEP_US
             if self.next_state is None:

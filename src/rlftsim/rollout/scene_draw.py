@@ -1,4 +1,4 @@
-"""Initial states of a whole scene, drawn from the lanes: what scenario generation lets a model know of a log.
+"""Initial states of a whole scene, drawn from the lanes, by the rules of the scenario generation challenge.
 
 The challenge gives map, past and present lights, the ego's past, and the number of agents of each type. The logged
 states of the other agents must not be read. The draw has no model of where traffic is and how fast: agents stand or
@@ -37,7 +37,7 @@ MAX_DRAWS = 30
 
 
 def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
-    """The scenario without its future, named after the rollout, with drawn histories of all agents but the ego.
+    """The scenario without a future, named after the rollout, with drawn histories of all agents but the ego.
 
     Args:
         scenario: Scenario whose map, lights up to the current step, ego's past, object ids and types are read.
