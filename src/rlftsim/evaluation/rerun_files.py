@@ -39,7 +39,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
         DataError: A file that cannot be written.
     """
     try:
-        import rerun as rr
+        import rerun as rr  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise ConfigError("Rerun's recordings need rerun-sdk: pip install 'rlftsim[rerun]'.") from None
 

@@ -130,7 +130,7 @@ def check_sources(data: ScenarioDataset) -> None:
     sources = sorted(set(data.sources) - {"womd", "synthetic", "unknown"})
     if sources:
         raise DataError(
-            f"{data.folder}: scenarios of the source {' and '.join(sources)}: the server scores WOMD alone; "
+            f"{data.folder}: scenarios of the source {' and '.join(sources)}: the Sim Agents server scores WOMD alone; "
             "convert a split of it, or score these rollouts with `rlftsim evaluate`."
         )
 
