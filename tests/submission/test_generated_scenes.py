@@ -175,7 +175,7 @@ def test_a_draw_reads_nothing_of_the_other_agents_but_their_number_and_types(dat
     ego = int(np.searchsorted(scenario.simulated_indices, scenario.ego_index))
     np.testing.assert_allclose(first.position[ego], tracks.position[scenario.ego_index, :11], atol=1e-4)
     now, angle, size = first.position[:, 10, :2], first.heading[:, 10], first.size[:, 10]
-    hits = [boxes_overlap(now - now[a], angle[a], angle, size[a], size).sum() - 1 for a in range(len(now))]
+    hits = [boxes_overlap(now - now[a], angle[a : a + 1], angle, size[a], size).sum() - 1 for a in range(len(now))]
     assert sum(hits) <= 0.1 * len(now)
     assert len({draw_scene(scenario, n, seed=1).tracks.position[:, 10].tobytes() for n in range(3)}) == 3
 

@@ -70,7 +70,7 @@ def draw_scene(scenario: Scenario, rollout: int, *, seed: int) -> Scenario:
             states[agent, :, 2] += size[agent, 2] / 2
             pose, neighbors = states[agent, CURRENT_STEP], states[present, CURRENT_STEP]
             gap = neighbors[:, :2] - pose[:2]
-            if not boxes_overlap(gap, pose[3], neighbors[:, 3], size[agent], size[present]).any():
+            if not boxes_overlap(gap, pose[3:], neighbors[:, 3], size[agent], size[present]).any():
                 break
         present.append(agent)
     position = states[..., :3].astype(np.float32)
