@@ -93,6 +93,7 @@ def test_the_sizes_of_every_step_count():
     assert rates[0] < rates[1] == 1.0
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_rollouts_of_the_other_challenge_are_refused():
     scenario = draw_scenario()
     rollouts, scenes = draw_rollouts(scenario, 2, seed=0), draw_scenes(scenario, 2, seed=0)
