@@ -93,7 +93,6 @@ def test_the_sizes_of_every_step_count():
     assert rates[0] < rates[1] == 1.0
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_rollouts_of_the_other_challenge_are_refused():
     scenario = draw_scenario()
     rollouts, scenes = draw_rollouts(scenario, 2, seed=0), draw_scenes(scenario, 2, seed=0)
@@ -105,8 +104,14 @@ def test_rollouts_of_the_other_challenge_are_refused():
         score(scenario, scenes, METRIC_2025)
     with pytest.raises(ConfigError, match="metric 2025-scenario-gen scores Scenario Generation"):
         score_batch([scenario], [rollouts], METRIC_2025_SCENARIO_GEN)
-    with pytest.raises(DataError, match=r"Sizes of generated agents must be \[2, 5, 91, 3\]"):
-        dataclasses.replace(scenes, size=scenes.size[:, :, :80])
-    with pytest.raises(DataError, match=r"T = 91\], got"):
-        dataclasses.replace(scenes, x=scenes.x[..., :80])
     assert np.isfinite(score(scenario, scenes, METRIC_2025_SCENARIO_GEN).likelihoods.numpy()).all()
+
+
+def test_wrong_shapes_are_refused():
+    scenes = draw_scenes(draw_scenario(), 2, seed=0)
+    names = ("x", "y", "z", "heading")
+    short = {name: getattr(scenes, name)[..., :80] for name in names}
+    with pytest.raises(DataError, match=r"Sizes of generated agents must be \[2, 5, 91, 3\]"):
+        dataclasses.replace(scenes, **short, size=scenes.size[:, :, :80])
+    with pytest.raises(DataError, match=r"T = 80\], got"):
+        dataclasses.replace(scenes, size=None)
