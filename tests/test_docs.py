@@ -34,6 +34,7 @@ TAKEN_FOR_GRANTED = {
     "gpudrive.md": ("GPUDrive_mini",),
     "machines.md": ("data", "runs"),
     "rollout_formats.md": ("data", "rollouts", "predictions", "messages"),
+    "scenario_generation.md": ("data", "runs", "submission.toml"),
     "start.md": ("womd", "argoverse2"),
     "studio.md": ("runs",),
     "submission.md": ("data", "runs"),

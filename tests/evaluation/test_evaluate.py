@@ -11,6 +11,7 @@ import torch
 import scenes
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as module
+from rlftsim.evaluation import rollout_states
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
 from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation, run_groups
@@ -110,9 +111,9 @@ def test_a_future_of_padding_is_no_future(tmp_path):
 
 def test_a_deterministic_policy_is_simulated_once_and_scored_as_if_every_time(data, tmp_path, monkeypatch):
     simulated = []
-    original = module.simulate
+    original = rollout_states.simulate
     monkeypatch.setattr(
-        module, "simulate", lambda *a, **k: simulated.append(len(k["num_rollouts"])) or original(*a, **k)
+        rollout_states, "simulate", lambda *a, **k: simulated.append(len(k["num_rollouts"])) or original(*a, **k)
     )
     config = replace(CONFIG, limit=1)
     once = evaluate(ConstantVelocity(), data, tmp_path, config, name="cv")
@@ -160,11 +161,11 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeyp
     whole = evaluate(Wobble(), data, tmp_path, CONFIG, name="whole")
     original, seen = module.scenario_log, []
 
-    def interrupt_at_the_sixth(scenario, device):
+    def interrupt_at_the_sixth(scenario, device, **rules):
         if len(seen) == 5:
             raise KeyboardInterrupt
         seen.append(scenario.scenario_id)
-        return original(scenario, device)
+        return original(scenario, device, **rules)
 
     monkeypatch.setattr(module, "scenario_log", interrupt_at_the_sixth)
     with pytest.raises(KeyboardInterrupt):
@@ -173,9 +174,9 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeyp
     assert len(list((tmp_path / "cut.parts").glob("*.parquet"))) == 1
     rest = []
 
-    def note(scenario, device):
+    def note(scenario, device, **rules):
         rest.append(scenario.scenario_id)
-        return original(scenario, device)
+        return original(scenario, device, **rules)
 
     monkeypatch.setattr(module, "scenario_log", note)
     assert same(evaluate(Wobble(), data, tmp_path, CONFIG, name="cut"), whole)

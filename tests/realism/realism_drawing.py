@@ -105,3 +105,19 @@ def draw_rollouts(scenario, num_rollouts, seed, *, spread=2.0):
 def select_rollouts(states, index):
     """Some of the rollouts, in the given order."""
     return SimulatedStates(states.object_id, *(v[index] for v in (states.x, states.y, states.z, states.heading)))
+
+
+def draw_scenes(scenario, num_rollouts, seed, *, spread=2.0):
+    """Whole scenes: the log with offsets and sizes of their own at every step, coordinates multiples of 1/64 m."""
+    random = np.random.default_rng(seed)
+    simulated = scenario.simulated_indices
+    shape = (num_rollouts, len(simulated), 1)
+    offset = random.normal(0, spread, (*shape, 3)) * np.linspace(0.2, 1, 91)[:, None] * [1, 0.7, 0.02]
+    position = np.round((scenario.tracks.position[simulated] + offset) * 64) / 64
+    heading = scenario.tracks.heading[simulated] + random.normal(0, 0.1, shape)
+    size = scenario.tracks.size[simulated] * random.uniform(0.8, 1.2, (*shape, 3)) * np.linspace(1, 1.1, 91)[:, None]
+    x, y, z, heading, *size = (
+        torch.from_numpy(values.astype(np.float32))
+        for values in (*np.moveaxis(position, -1, 0), heading, *np.moveaxis(np.round(size * 64) / 64, -1, 0))
+    )
+    return SimulatedStates(scenario.tracks.object_id[simulated], x, y, z, heading, size=torch.stack(size, -1))

@@ -18,10 +18,10 @@ from rlftsim.realism.interactive import (
 
 def draw_boxes(rows, *, valid=None):
     """Boxes (x, y, heading, length, width) at one step of one rollout, the first one evaluated."""
-    x, y, heading, length, width = torch.tensor(rows, dtype=torch.float32).T
     shape = (1, len(rows), 1)
+    boxes = [column.reshape(shape) for column in torch.tensor(rows, dtype=torch.float32).T]
     valid = None if valid is None else torch.tensor(valid).view(shape)
-    return PlanarAgents(x.view(shape), y.view(shape), heading.view(shape), length, width, torch.tensor([0]), valid)
+    return PlanarAgents(*boxes, torch.tensor([0]), valid)
 
 
 def draw_crowd(seed, num_agents, num_evaluated, *, with_validity=False):
@@ -30,8 +30,8 @@ def draw_crowd(seed, num_agents, num_evaluated, *, with_validity=False):
     position = 3000 + 40 * torch.rand(2, 2, num_agents, 5, generator=generator)
     heading = 2 * math.pi * torch.rand(2, num_agents, 5, generator=generator) - math.pi
     length, width = (
-        1 + 5 * torch.rand(num_agents, generator=generator),
-        0.5 + torch.rand(num_agents, generator=generator),
+        1 + 5 * torch.rand(1, num_agents, 1, generator=generator),
+        0.5 + torch.rand(1, num_agents, 1, generator=generator),
     )
     valid = torch.rand(2, num_agents, 5, generator=generator) < 0.7 if with_validity else None
     evaluated = torch.randperm(num_agents, generator=generator)[:num_evaluated]

@@ -69,7 +69,7 @@ def test_the_corner_farthest_off_the_road_counts():
     y = torch.tensor([[[-4.0, -4.5, 0.0]]])
     zero = torch.zeros_like(y)
     agents = Trajectories(zero + 1, y, zero + 0.75, zero + np.pi / 2)
-    distance = compute_distance_to_road_edge(agents, torch.tensor([[4.0, 2.0, 1.5]]), edges, max_pairs=PAIRS)
+    distance = compute_distance_to_road_edge(agents, torch.tensor([[[4.0, 2.0, 1.5]]]), edges, max_pairs=PAIRS)
     torch.testing.assert_close(distance, torch.tensor([[[0.0, 0.5, -4.0]]]), atol=1e-5, rtol=0)
 
 

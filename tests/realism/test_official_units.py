@@ -49,38 +49,20 @@ def test_kinematics(units):
 
 def test_box_distance(units):
     states, valid, official = read(units, "box_states", "box_valid", "box_distance")
-    # Sizes differ from column to column there, so each of the 400 columns is a rollout of one step; sizes are per agent
-    # here, hence one call each.
-    for column in range(states.shape[1]):
-        x, y, _, length, width, _, heading = states[:, column].T
-        agents = PlanarAgents(
-            x.view(1, 3, 1),
-            y.view(1, 3, 1),
-            heading.reshape(1, 3, 1),
-            length,
-            width,
-            torch.tensor([0]),
-            valid[:, column].view(1, 3, 1),
-        )
-        distance = compute_distance_to_nearest_object(agents)[0, 0, 0]
-        torch.testing.assert_close(distance, official[column], atol=1e-5, rtol=1e-6)
+    # The 400 columns are steps, with sizes of their own.
+    x, y, _, length, width, _, heading = states[None].unbind(-1)
+    agents = PlanarAgents(x, y, heading, length, width, torch.tensor([0]), valid[None])
+    distance = compute_distance_to_nearest_object(agents)[0, 0]
+    torch.testing.assert_close(distance, official, atol=1e-5, rtol=1e-6)
 
 
 def test_time_to_collision(units):
     x, y, length, width, heading, valid = read(
         units, "ttc_x", "ttc_y", "ttc_length", "ttc_width", "ttc_heading", "ttc_valid"
     )
-    speed = compute_ground_speed(x, y)
-    seconds = torch.empty(2, x.shape[1])
-    for step in range(x.shape[1]):
-        agents = PlanarAgents(
-            *(values[None, :, step, None] for values in (x, y, heading)),
-            length[:, step],
-            width[:, step],
-            torch.tensor([0, 1]),
-            valid[None, :, step, None],
-        )
-        seconds[:, step] = compute_time_to_collision(agents, speed[None, :, step, None])[0, :, 0]
+    boxes = [values[None] for values in (x, y, heading, length, width)]
+    agents = PlanarAgents(*boxes, torch.tensor([0, 1]), valid[None])
+    seconds = compute_time_to_collision(agents, compute_ground_speed(x, y)[None])[0]
     torch.testing.assert_close(seconds, torch.from_numpy(units["ttc_seconds"]), atol=1e-5, rtol=0)
 
 
@@ -94,7 +76,7 @@ def test_road_edge_distance(units):
     states = torch.from_numpy(units["edge_states"])
     x, y, z, length, width, height, heading = states.T
     agents = Trajectories(*(values.reshape(1, -1, 1) for values in (x, y, z, heading)))
-    size = torch.stack([length, width, height], dim=-1)
+    size = torch.stack([length, width, height], dim=-1)[:, None]
     distance = compute_distance_to_road_edge(agents, size, edges, max_pairs=1 << 14)
     torch.testing.assert_close(distance.flatten(), torch.from_numpy(units["edge_distance"]), atol=1e-5, rtol=0)
 

@@ -1,6 +1,8 @@
 import errno
+import gc
 import json
 import pickle
+import weakref
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -13,7 +15,7 @@ import scenes
 from rlftsim.errors import DataError
 from rlftsim.rollout.edge_scenes import move_scenario
 from rlftsim.scenario.dataset import ScenarioDataset, read_manifest, write_dataset
-from rlftsim.scenario.types import LaneTopology
+from rlftsim.scenario.types import LaneTopology, cached_on_scenario
 from rlftsim.scenario.womd import read_scenarios, scenario_from_bytes
 
 
@@ -332,3 +334,18 @@ def test_every_official_scenario_comes_back_bit_by_bit_and_small(shared, tmp_pat
     assert [difference for a, b in zip(scenarios, dataset, strict=True) for difference in differences(a, b)] == []
     size = sum(path.stat().st_size for path in (tmp_path / "data").rglob("*.*") if path.is_file())
     assert size / len(scenarios) < 120_000
+
+
+def test_values_cached_on_a_scenario_go_with_it_and_are_not_pickled():
+    @cached_on_scenario
+    def neighbors(scenario):
+        return [scenario]  # refers to the scenario
+
+    drawn = scenes.straight_road("a")
+    assert neighbors(drawn) is neighbors(drawn)
+    copied = pickle.loads(pickle.dumps(drawn))
+    assert neighbors(copied) == [copied]
+    reference = weakref.ref(drawn)
+    del drawn
+    gc.collect()
+    assert reference() is None

@@ -18,8 +18,8 @@ import pytest
 
 import scenes
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.evaluate import simulate_states
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.submission_pb2 import ScenarioRollouts
-from rlftsim.realism import SimulatedStates
-from rlftsim.submission.messages import TRAJECTORY_BYTES, decode_rollouts, encode_rollouts
+from rlftsim.realism import SIM_AGENTS, SimulatedStates
+from rlftsim.submission.messages import count_bytes, decode_rollouts, encode_rollouts
 
 IDS = st.lists(st.integers(-(2**31), 2**31 - 1), unique=True, max_size=5)
 
@@ -36,7 +36,7 @@ def test_bytes_are_those_of_protobuf(name, ids, num_scenes):
 
 def test_an_agent_takes_the_forecast_bytes_in_a_scene():
     few, many = (len(encode_rollouts("a", states(list(range(n)), 32))) for n in (10, 30))
-    assert (many - few) / (20 * 32) == pytest.approx(TRAJECTORY_BYTES, abs=4)  # and the headers around them
+    assert (many - few) / (20 * 32) == pytest.approx(count_bytes(SIM_AGENTS), abs=4)  # and the headers around them
 
 
 def test_values_come_back_bit_for_bit_in_any_layout():

@@ -110,7 +110,7 @@ def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
     motion = (x, y, record.z, record.motion[..., 2])
     states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in motion))
     size = torch.from_numpy(scene.size).float()
-    off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy()
+    off = compute_distance_to_road_edge(states, size[:, None], edges, max_pairs=MAX_PAIRS)[0].numpy()
     return ((off >= OUTSIDE_M) & record.is_observed).any(1) & (off[:, 0] < OUTSIDE_M)
 
 

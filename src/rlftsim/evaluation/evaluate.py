@@ -8,26 +8,20 @@ from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
-
-import torch
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation
+from rlftsim.evaluation.rollout_states import Oracle, simulate_evaluated
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
-from rlftsim.goals.types import Goals, logged_goals
 from rlftsim.jobs.items import group_positions, run_items
 from rlftsim.jobs.runner import Advance, Runner, check_jobs, choose_runner
-from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
-from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
+from rlftsim.realism import metric_by_name, scenario_log, score
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
-from rlftsim.rollout.simulate import check_sampling, simulate
-from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.rollout.simulate import check_sampling
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
-
-Oracle = Literal["oracle"]
 
 
 def evaluate(
@@ -66,6 +60,8 @@ def evaluate(
     name = name or (title if is_oracle else f"{title}-{fingerprint[:8]}")
     if config.goals != "none" and not is_goal_conditioned(policy):
         raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
+    if config.goals != "none" and config.challenge.makes_scenes:
+        raise ConfigError(f"metric {config.metric} is of drawn agents, which have no logged goals: leave goals out.")
     # Everything that can be refused is refused before anything is simulated or written.
     dataset, config = open_held_out(data, config)
     ids = choose_scenarios(dataset, config)
@@ -119,62 +115,6 @@ def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: Evalu
     }
 
 
-def simulate_states(
-    policy: Policy, batch: ScenarioBatch, config: EvaluateConfig, *, context: Any = None, goals: Goals | None = None
-) -> SimulatedStates:
-    """All rollouts of a scenario, simulated a few at a time; a deterministic policy is simulated once.
-
-    Args:
-        policy: Policy of all agents.
-        batch: The scenario alone, on the policy's device; simulated from the current step on.
-        config: Number of rollouts, rollouts at a time, seed, sampling.
-        context: Result of an earlier `policy.encode(batch)`; None = encode here.
-        goals: Goals of a single rollout, the same in all; None = goal-free.
-
-    Raises:
-        ConfigError: The policy cannot sample as `config` says, e.g. top-k without categories.
-        DataError: A pose of the policy is not finite.
-    """
-    if context is None:
-        with torch.no_grad():
-            context = policy.encode(batch)
-    is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
-    ids = range(config.num_rollouts if is_random else 1)
-    passes = []
-    for first in range(0, len(ids), config.rollouts_per_pass):
-        # Noise belongs to rollout ids, so the passes together draw what a single pass would.
-        rollouts = simulate(
-            policy, batch, num_rollouts=ids[first : first + config.rollouts_per_pass], seed=config.seed,
-            context=context, sampling=config.sampling, goals=goals,
-        )  # fmt: skip
-        passes.append(states_of_rollouts(batch, rollouts)[0])
-    x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
-    joined = SimulatedStates(passes[0].object_id, x, y, z, heading)  # each [N, A, T]
-    # The metric would count NaN in a last bin, as no collision and no way off the road: a better score for nothing.
-    joined.check_finite(batch.scenarios[0].scenario_id)
-    # Equal rollouts of a deterministic policy are counted by the metric as often as rollouts were wanted.
-    return joined if is_random else replace(joined, repeat=config.num_rollouts)
-
-
-def simulate_evaluated(policy: Policy | Oracle, batch: ScenarioBatch, config: EvaluateConfig) -> SimulatedStates:
-    """Rollouts of a scenario as an evaluation scores them.
-
-    Args:
-        policy: Policy of all agents, or "oracle" for the log.
-        batch: The scenario alone, with a logged future.
-        config: Number of rollouts, seed, sampling, goals.
-
-    Raises:
-        ConfigError, DataError: See `simulate_states`.
-    """
-    device = get_device(policy)
-    if isinstance(policy, str):
-        return logged_states(batch.scenarios[0], num_rollouts=config.num_rollouts, device=device)
-    batch = batch.to(device)
-    goals = logged_goals(batch, batch.evaluated_mask) if config.goals == "logged" else None
-    return simulate_states(policy, batch, config, goals=goals)
-
-
 def _evaluate_group(
     policy: Policy | Oracle,
     dataset: ScenarioDataset,
@@ -201,7 +141,7 @@ def _evaluate_group(
             ) from None
         # Without a road edge, for instance, the official metric is undefined.
         try:
-            log = scenario_log(scenario, device)
+            log = scenario_log(scenario, device, challenge=config.challenge)
         except DataError as error:
             results.append(Skipped(scenario.scenario_id, str(error)))
         else:

@@ -4,7 +4,7 @@ The ceiling is the oracle: the log, repeated as often as there are rollouts. The
 meta-metric of the rollouts, is split without remainder, by the rule of `realism.credit`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -133,7 +133,7 @@ def _mean_terms(log: ScenarioLog, features: Features, config: MetricConfig) -> F
     target, table = log_target(log, config), histogram_table(config, torch.device("cpu"))
     # Row 0 of the sets is that of all rollouts; in float64, so that the parts add up.
     sets, size = form_sets(count_rollouts(features, log, config), features.repeat)
-    all_rollouts = type(sets)(sets.bins[:1].double(), sets.agreement[:1].double(), sets.num_steps)
+    all_rollouts = replace(sets, bins=sets.bins[:1].double(), agreement=sets.agreement[:1].double())
     num_samples = size[:1].double() * all_rollouts.num_steps
     log_probability = compute_log_probabilities(all_rollouts.bins, num_samples, table)[0]  # [H, E, K]
     logged = stack_histogram_features(log.features)[:, 0]  # [H, E, T]

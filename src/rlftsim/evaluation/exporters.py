@@ -38,6 +38,7 @@ EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
         "page": "rlftsim.evaluation.exporters:write_player",
         "film": "rlftsim.evaluation.exporters:write_film",
         "gpudrive": "rlftsim.evaluation.gpudrive_files:write_gpudrive",
+        "rerun": "rlftsim.evaluation.rerun_files:write_rerun",
     },
     use=lambda name: exporter_by_name(name),
 )

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import describe_measurement, simulate_states
+from rlftsim.evaluation.evaluate import describe_measurement
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry

@@ -4,6 +4,7 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and
 """
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -22,7 +23,7 @@ from rlftsim.evaluation.drift import Drift, measure_drift
 from rlftsim.jobs.documents import describe_type, parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet
-from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
+from rlftsim.realism import FEATURE_NAMES, Challenge, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.config import LIGHT
 from rlftsim.realism.miss import compute_miss_rates
 from rlftsim.rollout.policy import Sampling
@@ -68,7 +69,7 @@ class EvaluateConfig:
     num_rollouts: int = 32
     """Rollouts per scenario; the official metric is defined for 32."""
     metric: str = "2025"
-    """Year of the meta-metric."""
+    """Year of the meta-metric, or "2025-scenario-gen"."""
     seed: int = 0
     temperature: float = 1.0
     """Below 1 likely decisions become likelier; 0 always takes the most likely one."""
@@ -95,6 +96,11 @@ class EvaluateConfig:
         check_not_negative(self, ("seed",))
         metric_by_name(self.metric)
         _ = self.sampling
+
+    @property
+    def challenge(self) -> Challenge:
+        """Challenge of the metric: whether agents go on from the log or whole scenes are made."""
+        return metric_by_name(self.metric).challenge
 
     @property
     def sampling(self) -> Sampling:
@@ -350,19 +356,24 @@ def row_of_result(
     light = result.likelihood(LIGHT)
     light_weight = dict(zip(FEATURE_NAMES, result.config.weights))[LIGHT]
     missing = light_weight * (1.0 - light) if light_weight else 0.0
-    misses = compute_miss_rates(scenario, states)
-    scores = {
-        "meta_metric_light_one": result.meta_metric + missing,
-        "miss_rate": misses.at_goal,
-        "passing_miss_rate": misses.passing,
-        "min_passing_miss_rate": misses.passing_in_every_rollout,
-        **measure_drift(scenario, states)._asdict(),
-    }
+    scores = {"meta_metric_light_one": result.meta_metric + missing}
+    if states.challenge.makes_scenes:  # agents that are drawn have no log to miss or to drift from
+        names = ("miss_rate", "passing_miss_rate", "min_passing_miss_rate", *Drift._fields)
+        scores |= dict.fromkeys(names, math.nan)
+    else:
+        misses = compute_miss_rates(scenario, states)
+        scores |= {
+            "miss_rate": misses.at_goal,
+            "passing_miss_rate": misses.passing,
+            "min_passing_miss_rate": misses.passing_in_every_rollout,
+            **measure_drift(scenario, states)._asdict(),
+        }
     numbers = {name: float(scores[name] if name in scores else result.find_score(name)) for name in SCORE_COLUMNS}
+    evaluated = scenario.simulated_indices if states.challenge.makes_scenes else scenario.evaluated_indices
     return {
         "scenario_id": result.scenario_ids[0],
         "num_agents": len(scenario.simulated_indices),
-        "num_evaluated": len(scenario.evaluated_indices),
+        "num_evaluated": len(evaluated),
         CLUSTER: cluster or "",
         **numbers,
     }

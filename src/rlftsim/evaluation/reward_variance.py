@@ -18,9 +18,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.evaluate import describe_measurement, simulate_states
+from rlftsim.evaluation.evaluate import describe_measurement
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
 from rlftsim.jobs.runner import check_jobs
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features

@@ -55,7 +55,8 @@ class PoseChecks:
 
     Args:
         object_ids: Agents of the rollouts in their order, A of them, all simulated in the scenario.
-        poses: x, y, z and heading in the world frame, [N, A, 4, 80] float32.
+        poses: x, y, z and heading in the world frame, [N, A, 4, 80] float32; [N, A, 4, 91] of generated scenes, which
+            are judged by their own first steps.
         scenario: Log up to the current step.
         only_logged: True leaves out the steps at which the log has no state of the agent, which hold anything where
             rollouts are copies of the log.
@@ -77,6 +78,9 @@ class PoseChecks:
         self.position = tracks.position[rows, CURRENT_STEP]  # [A, 3]
         self.heading = tracks.heading[rows, CURRENT_STEP]  # [A]
         self.velocity = tracks.velocity[rows, CURRENT_STEP]  # [A, 2]
+        if poses.shape[-1] == TOTAL_STEPS:  # with an axis of rollouts in front
+            self.position, self.heading = poses[:, :, :3, 0], poses[:, :, 3, 0]
+            self.velocity = (poses[:, :, :2, 1] - poses[:, :, :2, 0]) / np.float32(STEP_S)
         self.has_front = np.isin(tracks.object_type[rows], TYPES_WITH_FRONT)  # [A]
         self.is_judged = np.ones((len(rows), poses.shape[-1]), bool)  # [A, T]
         if only_logged and scenario.has_future:
@@ -112,7 +116,7 @@ class PoseChecks:
             yield Doubt("not finite", text, self.object_ids[agent], rollout, is_impossible=True)
             return
         x, y, z, turned = (poses[:, :, axis] for axis in range(4))  # each [N, A, T]
-        from_start = _square(x - start[:, 0, None], y - start[:, 1, None])
+        from_start = _square(x - start[..., 0, None], y - start[..., 1, None])
         farthest = _largest(from_start * is_judged).root
         if farthest.value > MAX_DISTANCE_M:
             text = f"{farthest.value:.0f} m from its current position, beyond {MAX_DISTANCE_M:.0f} m,"
@@ -125,7 +129,7 @@ class PoseChecks:
         largest = _largest(np.abs(turned) * is_judged)
         # Either all within a turn, where a step through pi jumps by a turn, or turned continuously.
         is_wrapped = (np.abs(turned) <= math.pi + 1e-4).all(-1, keepdims=True)  # [N, A, 1]
-        current_heading = np.broadcast_to(self.heading[:, None], (*turned.shape[:2], 1))
+        current_heading = np.broadcast_to(self.heading[..., None], (*turned.shape[:2], 1))
         change = _largest(np.abs(np.diff(turned, prepend=current_heading)) * (is_judged & ~is_wrapped))
         if largest.value > MAX_HEADING_RAD:
             yield self._doubt("heading", f"heading of {largest.value:.0f} rad (degrees?)", largest)
@@ -134,12 +138,12 @@ class PoseChecks:
                 text = f"heading changes by {change.value:.2f} rad in 0.1 s, over half a turn,"
                 yield self._doubt("turn", text, change)
             yield from self._facing_doubts()
-        climb = _largest(np.abs(z - start[:, 2, None]) * is_judged)
+        climb = _largest(np.abs(z - start[..., 2, None]) * is_judged)
         if climb.value > MAX_HEIGHT_CHANGE_M:
             yield self._doubt("height", f"z is {climb.value:.0f} m from that of the current step", climb)
-        elif not z.any() and start[:, 2].any():
+        elif not z.any() and start[..., 2].any():
             yield Doubt("height", "z is 0 everywhere, in the log it is not: speed and road edges are 3-D")
-        is_moving = np.hypot(self.velocity[:, 0], self.velocity[:, 1]) > MOVING_MPS
+        is_moving = np.atleast_2d(np.hypot(self.velocity[..., 0], self.velocity[..., 1]) > MOVING_MPS).any(0)  # [A]
         if is_moving.any() and (poses[:, is_moving, :2] == poses[:1, is_moving, :2]).all():
             yield Doubt("equal", f"all {len(poses)} rollouts are equal: the metric compares distributions")
 

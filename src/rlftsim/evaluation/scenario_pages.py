@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import simulate_evaluated
 from rlftsim.evaluation.explain import explain
 from rlftsim.evaluation.explain_page import explanation_html, write_files
 from rlftsim.evaluation.exporters import animate_states
 from rlftsim.evaluation.results import Evaluation
+from rlftsim.evaluation.rollout_states import simulate_evaluated
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.runner import check_jobs, choose_runner
@@ -37,8 +37,9 @@ class EvaluatedModels:
 
     @property
     def can_simulate(self) -> bool:
-        """True if scenarios and at least one model are at hand."""
-        return bool(self.policies) and self.dataset is not None
+        """True if scenarios and at least one model are at hand, and agents go on from the log, as pages show them."""
+        makes_scenes = any(evaluation.config.challenge.makes_scenes for evaluation in self.evaluations)
+        return bool(self.policies) and self.dataset is not None and not makes_scenes
 
     def animate(self, scenario_id: str, caption: str = "") -> Animation:
         """The log beside the first rollouts of each model at hand.

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n#rlftsim/evaluation/submission.proto\x12\x12rlftsim.submission\"\x92\x01\n\x13SimulatedTrajectory\x12\x14\n\x08\x63\x65nter_x\x18\x02 \x03(\x02\x42\x02\x10\x01\x12\x14\n\x08\x63\x65nter_y\x18\x03 \x03(\x02\x42\x02\x10\x01\x12\x14\n\x08\x63\x65nter_z\x18\x04 \x03(\x02\x42\x02\x10\x01\x12\x13\n\x07heading\x18\x05 \x03(\x02\x42\x02\x10\x01\x12\x11\n\tobject_id\x18\x06 \x01(\x05\x12\x11\n\x05valid\x18\x0b \x03(\x08\x42\x02\x10\x01\"U\n\nJointScene\x12G\n\x16simulated_trajectories\x18\x01 \x03(\x0b\x32\'.rlftsim.submission.SimulatedTrajectory\"]\n\x10ScenarioRollouts\x12\x13\n\x0bscenario_id\x18\x01 \x01(\t\x12\x34\n\x0cjoint_scenes\x18\x02 \x03(\x0b\x32\x1e.rlftsim.submission.JointScene\"\xc4\x04\n\x1cSimAgentsChallengeSubmission\x12?\n\x11scenario_rollouts\x18\x01 \x03(\x0b\x32$.rlftsim.submission.ScenarioRollouts\x12X\n\x0fsubmission_type\x18\x02 \x01(\x0e\x32?.rlftsim.submission.SimAgentsChallengeSubmission.SubmissionType\x12\x14\n\x0c\x61\x63\x63ount_name\x18\x03 \x01(\t\x12\x1a\n\x12unique_method_name\x18\x04 \x01(\t\x12\x0f\n\x07\x61uthors\x18\x05 \x03(\t\x12\x13\n\x0b\x61\x66\x66iliation\x18\x06 \x01(\t\x12\x13\n\x0b\x64\x65scription\x18\x07 \x01(\t\x12\x13\n\x0bmethod_link\x18\x08 \x01(\t\x12\x17\n\x0fuses_lidar_data\x18\t \x01(\x08\x12\x18\n\x10uses_camera_data\x18\n \x01(\x08\x12%\n\x1duses_public_model_pretraining\x18\x0b \x01(\x08\x12\x1c\n\x14num_model_parameters\x18\x0c \x01(\t\x12\x1a\n\x12public_model_names\x18\r \x03(\t\x12\x39\n1acknowledge_complies_with_closed_loop_requirement\x18\x0e \x01(\x08\"8\n\x0eSubmissionType\x12\x0b\n\x07UNKNOWN\x10\x00\x12\x19\n\x15SIM_AGENTS_SUBMISSION\x10\x01')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n#rlftsim/evaluation/submission.proto\x12\x12rlftsim.submission\"\xe2\x01\n\x13SimulatedTrajectory\x12\x14\n\x08\x63\x65nter_x\x18\x02 \x03(\x02\x42\x02\x10\x01\x12\x14\n\x08\x63\x65nter_y\x18\x03 \x03(\x02\x42\x02\x10\x01\x12\x14\n\x08\x63\x65nter_z\x18\x04 \x03(\x02\x42\x02\x10\x01\x12\x13\n\x07heading\x18\x05 \x03(\x02\x42\x02\x10\x01\x12\x11\n\tobject_id\x18\x06 \x01(\x05\x12\x11\n\x05width\x18\x07 \x03(\x02\x42\x02\x10\x01\x12\x12\n\x06length\x18\x08 \x03(\x02\x42\x02\x10\x01\x12\x12\n\x06height\x18\t \x03(\x02\x42\x02\x10\x01\x12\x13\n\x0bobject_type\x18\n \x01(\x05\x12\x11\n\x05valid\x18\x0b \x03(\x08\x42\x02\x10\x01\"U\n\nJointScene\x12G\n\x16simulated_trajectories\x18\x01 \x03(\x0b\x32\'.rlftsim.submission.SimulatedTrajectory\"]\n\x10ScenarioRollouts\x12\x13\n\x0bscenario_id\x18\x01 \x01(\t\x12\x34\n\x0cjoint_scenes\x18\x02 \x03(\x0b\x32\x1e.rlftsim.submission.JointScene\"\xc4\x04\n\x1cSimAgentsChallengeSubmission\x12?\n\x11scenario_rollouts\x18\x01 \x03(\x0b\x32$.rlftsim.submission.ScenarioRollouts\x12X\n\x0fsubmission_type\x18\x02 \x01(\x0e\x32?.rlftsim.submission.SimAgentsChallengeSubmission.SubmissionType\x12\x14\n\x0c\x61\x63\x63ount_name\x18\x03 \x01(\t\x12\x1a\n\x12unique_method_name\x18\x04 \x01(\t\x12\x0f\n\x07\x61uthors\x18\x05 \x03(\t\x12\x13\n\x0b\x61\x66\x66iliation\x18\x06 \x01(\t\x12\x13\n\x0b\x64\x65scription\x18\x07 \x01(\t\x12\x13\n\x0bmethod_link\x18\x08 \x01(\t\x12\x17\n\x0fuses_lidar_data\x18\t \x01(\x08\x12\x18\n\x10uses_camera_data\x18\n \x01(\x08\x12%\n\x1duses_public_model_pretraining\x18\x0b \x01(\x08\x12\x1c\n\x14num_model_parameters\x18\x0c \x01(\t\x12\x1a\n\x12public_model_names\x18\r \x03(\t\x12\x39\n1acknowledge_complies_with_closed_loop_requirement\x18\x0e \x01(\x08\"8\n\x0eSubmissionType\x12\x0b\n\x07UNKNOWN\x10\x00\x12\x19\n\x15SIM_AGENTS_SUBMISSION\x10\x01')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -39,16 +39,22 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_SIMULATEDTRAJECTORY'].fields_by_name['center_z']._serialized_options = b'\020\001'
   _globals['_SIMULATEDTRAJECTORY'].fields_by_name['heading']._loaded_options = None
   _globals['_SIMULATEDTRAJECTORY'].fields_by_name['heading']._serialized_options = b'\020\001'
+  _globals['_SIMULATEDTRAJECTORY'].fields_by_name['width']._loaded_options = None
+  _globals['_SIMULATEDTRAJECTORY'].fields_by_name['width']._serialized_options = b'\020\001'
+  _globals['_SIMULATEDTRAJECTORY'].fields_by_name['length']._loaded_options = None
+  _globals['_SIMULATEDTRAJECTORY'].fields_by_name['length']._serialized_options = b'\020\001'
+  _globals['_SIMULATEDTRAJECTORY'].fields_by_name['height']._loaded_options = None
+  _globals['_SIMULATEDTRAJECTORY'].fields_by_name['height']._serialized_options = b'\020\001'
   _globals['_SIMULATEDTRAJECTORY'].fields_by_name['valid']._loaded_options = None
   _globals['_SIMULATEDTRAJECTORY'].fields_by_name['valid']._serialized_options = b'\020\001'
   _globals['_SIMULATEDTRAJECTORY']._serialized_start=60
-  _globals['_SIMULATEDTRAJECTORY']._serialized_end=206
-  _globals['_JOINTSCENE']._serialized_start=208
-  _globals['_JOINTSCENE']._serialized_end=293
-  _globals['_SCENARIOROLLOUTS']._serialized_start=295
-  _globals['_SCENARIOROLLOUTS']._serialized_end=388
-  _globals['_SIMAGENTSCHALLENGESUBMISSION']._serialized_start=391
-  _globals['_SIMAGENTSCHALLENGESUBMISSION']._serialized_end=971
-  _globals['_SIMAGENTSCHALLENGESUBMISSION_SUBMISSIONTYPE']._serialized_start=915
-  _globals['_SIMAGENTSCHALLENGESUBMISSION_SUBMISSIONTYPE']._serialized_end=971
+  _globals['_SIMULATEDTRAJECTORY']._serialized_end=286
+  _globals['_JOINTSCENE']._serialized_start=288
+  _globals['_JOINTSCENE']._serialized_end=373
+  _globals['_SCENARIOROLLOUTS']._serialized_start=375
+  _globals['_SCENARIOROLLOUTS']._serialized_end=468
+  _globals['_SIMAGENTSCHALLENGESUBMISSION']._serialized_start=471
+  _globals['_SIMAGENTSCHALLENGESUBMISSION']._serialized_end=1051
+  _globals['_SIMAGENTSCHALLENGESUBMISSION_SUBMISSIONTYPE']._serialized_start=995
+  _globals['_SIMAGENTSCHALLENGESUBMISSION_SUBMISSIONTYPE']._serialized_end=1051
 # @@protoc_insertion_point(module_scope)

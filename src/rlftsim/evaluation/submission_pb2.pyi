@@ -7,20 +7,28 @@ from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Map
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class SimulatedTrajectory(_message.Message):
-    __slots__ = ("center_x", "center_y", "center_z", "heading", "object_id", "valid")
+    __slots__ = ("center_x", "center_y", "center_z", "heading", "object_id", "width", "length", "height", "object_type", "valid")
     CENTER_X_FIELD_NUMBER: _ClassVar[int]
     CENTER_Y_FIELD_NUMBER: _ClassVar[int]
     CENTER_Z_FIELD_NUMBER: _ClassVar[int]
     HEADING_FIELD_NUMBER: _ClassVar[int]
     OBJECT_ID_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    LENGTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_TYPE_FIELD_NUMBER: _ClassVar[int]
     VALID_FIELD_NUMBER: _ClassVar[int]
     center_x: _containers.RepeatedScalarFieldContainer[float]
     center_y: _containers.RepeatedScalarFieldContainer[float]
     center_z: _containers.RepeatedScalarFieldContainer[float]
     heading: _containers.RepeatedScalarFieldContainer[float]
     object_id: int
+    width: _containers.RepeatedScalarFieldContainer[float]
+    length: _containers.RepeatedScalarFieldContainer[float]
+    height: _containers.RepeatedScalarFieldContainer[float]
+    object_type: int
     valid: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, center_x: _Optional[_Iterable[float]] = ..., center_y: _Optional[_Iterable[float]] = ..., center_z: _Optional[_Iterable[float]] = ..., heading: _Optional[_Iterable[float]] = ..., object_id: _Optional[int] = ..., valid: _Optional[_Iterable[bool]] = ...) -> None: ...
+    def __init__(self, center_x: _Optional[_Iterable[float]] = ..., center_y: _Optional[_Iterable[float]] = ..., center_z: _Optional[_Iterable[float]] = ..., heading: _Optional[_Iterable[float]] = ..., object_id: _Optional[int] = ..., width: _Optional[_Iterable[float]] = ..., length: _Optional[_Iterable[float]] = ..., height: _Optional[_Iterable[float]] = ..., object_type: _Optional[int] = ..., valid: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class JointScene(_message.Message):
     __slots__ = ("simulated_trajectories",)

@@ -38,7 +38,7 @@ def _outside_m(
     angle = torch.from_numpy(heading).float()
     states = Trajectories(*(v[None, None] for v in (x, y, z, angle)))  # one rollout, one agent: [1, 1, S]
     box = torch.from_numpy(size).float()[None]
-    return compute_distance_to_road_edge(states, box, edges, max_pairs=MAX_PAIRS)[0, 0].numpy()
+    return compute_distance_to_road_edge(states, box[:, None], edges, max_pairs=MAX_PAIRS)[0, 0].numpy()
 
 
 def propose(scenario: Scenario, track: int) -> tuple[Proposal, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from rlftsim.evaluation.evaluate import simulate_states
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import find_device
 from rlftsim.realism import compute_features, scenario_log

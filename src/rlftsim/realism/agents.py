@@ -2,7 +2,7 @@
 
 Simulated agents are all tracks valid at the current step, in track order; no other agent exists for the metric.
 Evaluated agents are the ego and the tracks to predict, by ascending object id. Sizes and types are those of the current
-step for all steps, in the log too.
+step for all steps, in the log too. In generated scenes all simulated agents are evaluated, with the size of each step.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, ObjectType, Scenario
+from rlftsim.realism.config import SCENARIO_GEN, SIM_AGENTS, Challenge
+from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
 
 NUM_HISTORY_STEPS = 2
 """Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
@@ -25,7 +26,8 @@ NUM_HISTORY_STEPS = 2
 class SimulatedStates:
     """Future states of a scenario's simulated agents in N rollouts, world frame, float32, on a single device.
 
-    Every agent exists at all T = 80 steps. Agents may come in any order, named by `object_id`.
+    Every agent exists at all T = 80 steps, or T = 91 of a generated scene. Agents may come in any order, named by
+    `object_id`.
     """
 
     object_id: Int[np.ndarray, "A"]
@@ -36,19 +38,29 @@ class SimulatedStates:
     heading: Float[Tensor, "N A T"]
     repeat: int = 1
     """Number of identical rollouts behind each row: 32 equal rollouts are scored at the cost of a single rollout."""
+    size: Float[Tensor, "N A T 3"] | None = None
+    """Length, width, height of generated agents, m; None = agents go on from the log, with the sizes there."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
-        expected_shape = (*self.x.shape[:1], len(self.object_id), FUTURE_STEPS)
+        num_steps = self.challenge.num_steps
+        expected_shape = (*self.x.shape[:1], len(self.object_id), num_steps)
+        if self.size is not None and tuple(self.size.shape) != (*expected_shape, 3):
+            raise DataError(f"Sizes of generated agents must be {[*expected_shape, 3]}, got {list(self.size.shape)}.")
         for name in ("x", "y", "z", "heading"):
             values = getattr(self, name)
             if tuple(values.shape) != expected_shape or values.dtype != torch.float32:
                 raise DataError(
-                    f"Simulated {name} must be float32 of shape [N, A = {len(self.object_id)}, T = {FUTURE_STEPS}], "
-                    f"got {values.dtype} {list(values.shape)}: one row per object id, 80 steps at 10 Hz."
+                    f"Simulated {name} must be float32 of shape [N, A = {len(self.object_id)}, T = {num_steps}], "
+                    f"got {values.dtype} {list(values.shape)}: one row per object id, {num_steps} steps at 10 Hz."
                 )
         if self.repeat < 1 or expected_shape[0] < 1:
             raise DataError(f"At least one rollout is needed, got {expected_shape[0]} x repeat {self.repeat}.")
+
+    @property
+    def challenge(self) -> Challenge:
+        """Challenge whose steps the states are of."""
+        return SIM_AGENTS if self.size is None else SCENARIO_GEN
 
     @property
     def device(self) -> torch.device:
@@ -161,26 +173,28 @@ class LoggedAgents:
     evaluated_object_id: Int64[np.ndarray, "E"]
     evaluated_object_type: Int64[np.ndarray, "E"]
     is_vehicle: Bool[Tensor, "E"]
-    size: Float[Tensor, "A 3"]
-    """Length, width, height at the current step."""
+    size: Float[Tensor, "A #T 3"]
+    """Length, width, height: at the current step, or at each step of a generated scene."""
     trajectories: Trajectories
     """[A, 91]. Invalid states keep what the file stores, because speeds of neighboring steps read them."""
     valid: Bool[Tensor, "A 91"]
     layout: Layout | None = None
     """Of several scenarios; None = there is one."""
+    challenge: Challenge = SIM_AGENTS
 
     @property
     def future_valid(self) -> Bool[Tensor, "E T"]:
-        """Log validity of the evaluated agents at the future steps."""
-        return self.valid.index_select(0, self.evaluated)[:, CURRENT_STEP + 1 :]
+        """Log validity of the evaluated agents at the simulated steps."""
+        return self.valid.index_select(0, self.evaluated)[:, self.challenge.first_step :]
 
 
-def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgents:
+def build_logged_agents(scenario: Scenario, device: torch.device, challenge: Challenge = SIM_AGENTS) -> LoggedAgents:
     """The simulated agents of a scenario.
 
     Args:
         scenario: Scenario with its logged future, 91 steps.
         device: Device of the returned tensors; rollouts must lie there to be scored.
+        challenge: Rules that say which agents are evaluated, and from which step on.
 
     Raises:
         DataError: The scenario has no logged future or no evaluated agent.
@@ -191,6 +205,9 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
             "withheld in a test split) it cannot be scored. Use training or validation data."
         )
     tracks, simulated, evaluated = scenario.tracks, scenario.simulated_indices, scenario.evaluated_indices
+    size_steps = slice(CURRENT_STEP, CURRENT_STEP + 1)
+    if challenge.makes_scenes:
+        evaluated, size_steps = simulated, slice(TOTAL_STEPS)
     if len(evaluated) == 0:
         raise DataError(
             f"Scenario {scenario.scenario_id} has no evaluated agent that is valid at the current step: leave it out."
@@ -205,9 +222,10 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
         evaluated_object_id=tracks.object_id[evaluated].astype(np.int64),
         evaluated_object_type=object_type,
         is_vehicle=torch.from_numpy(object_type == ObjectType.VEHICLE).to(device),
-        size=torch.from_numpy(tracks.size[simulated, CURRENT_STEP]).to(device),
+        size=torch.from_numpy(tracks.size[simulated, size_steps]).to(device),
         trajectories=Trajectories(*trajectories.unbind(0)),
         valid=torch.from_numpy(tracks.valid[simulated, :TOTAL_STEPS]).to(device),
+        challenge=challenge,
     )
 
 
@@ -279,8 +297,12 @@ def match_agents(
     return order[np.searchsorted(rollout_ids[order], logged_ids)]
 
 
-def join_history(agents: LoggedAgents, states: SimulatedStates, scenario_id: str) -> Trajectories:
-    """Rollouts in track order with two steps of logged history in front: [N, A, 82].
+def join_history(
+    agents: LoggedAgents, states: SimulatedStates, scenario_id: str
+) -> tuple[Trajectories, Float[Tensor, "#N A #T 3"]]:
+    """Rollouts in track order with two steps of logged history in front, [N, A, 82], and the sizes of the boxes.
+
+    Generated scenes, [N, A, 91], have no history.
 
     Args:
         agents: Agents of the scenario as logged, whose order the result has.
@@ -288,18 +310,28 @@ def join_history(agents: LoggedAgents, states: SimulatedStates, scenario_id: str
         scenario_id: Scenario that messages name.
 
     Raises:
-        DataError: The agents of the rollouts are not those of the scenario.
+        DataError: The agents of the rollouts are not those of the scenario, or the steps those of another challenge.
     """
+    if states.challenge != agents.challenge:
+        raise DataError(
+            f"scenario {scenario_id}: {agents.challenge.title} scores {agents.challenge.num_steps} steps of an agent, "
+            f"and these rollouts have the {states.challenge.num_steps} of {states.challenge.title}: name a metric of "
+            "that challenge; `rlftsim evaluate` makes the rollouts that its metric wants."
+        )
     order = match_agents(agents.object_id, states.object_id, scenario_id)
     # Rollouts of our own policies come in track order already: no copy then.
     is_ordered = bool((order == np.arange(len(order))).all())
     index = None if is_ordered else torch.from_numpy(order).to(states.device)
-    first = CURRENT_STEP + 1 - NUM_HISTORY_STEPS
+    last = agents.challenge.first_step
+    first = max(last - NUM_HISTORY_STEPS, 0)
+
+    def in_order(values: Tensor) -> Tensor:
+        return values if index is None else values.index_select(1, index)
 
     def prepend(log: Tensor, future: Tensor) -> Tensor:
-        future = future if index is None else future.index_select(1, index)
-        history = log[:, first : CURRENT_STEP + 1].expand(future.shape[0], -1, -1)
-        return torch.cat([history, future], dim=-1)
+        history = log[:, first:last].expand(future.shape[0], -1, -1)
+        return torch.cat([history, in_order(future)], dim=-1)
 
     simulated = (states.x, states.y, states.z, states.heading)
-    return Trajectories(*(prepend(log, future) for log, future in zip(agents.trajectories, simulated)))
+    trajectories = Trajectories(*(prepend(log, future) for log, future in zip(agents.trajectories, simulated)))
+    return trajectories, agents.size[None] if states.size is None else in_order(states.size)

@@ -7,6 +7,7 @@ feature axis F of a tensor has the order of `FEATURE_NAMES`. Official messages h
 from dataclasses import dataclass, replace
 
 from rlftsim.errors import ConfigError, in_short
+from rlftsim.scenario.types import HISTORY_STEPS, TOTAL_STEPS
 
 HISTOGRAM_FEATURES = (
     "linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration",
@@ -43,6 +44,31 @@ _BUCKETS = {
     "min_average_displacement_error": "min_ade",
     **_RATES,
 }
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """Rules of a leaderboard: the steps of a scenario that are simulated and scored."""
+
+    name: str
+    title: str
+    first_step: int
+    """First of these steps, up to step 90. From 0 on, whole scenes are made: no history is given, boxes have sizes of
+    their own at each step, and every simulated agent is evaluated."""
+
+    @property
+    def num_steps(self) -> int:
+        """Number of simulated steps."""
+        return TOTAL_STEPS - self.first_step
+
+    @property
+    def makes_scenes(self) -> bool:
+        """True where agents begin with the scene, and not where the log stops."""
+        return self.first_step == 0
+
+
+SIM_AGENTS = Challenge("sim-agents", "Sim Agents", HISTORY_STEPS)
+SCENARIO_GEN = Challenge("scenario-gen", "Scenario Generation", 0)
 
 
 @dataclass(frozen=True)
@@ -87,6 +113,9 @@ class MetricConfig:
     """Score time to collision on evaluated vehicles only (code of 2025) or on all evaluated agents (code of 2024)."""
     reports_traffic_lights: bool = True
     """True if the official result of that year has traffic light fields."""
+    challenge: Challenge = SIM_AGENTS
+    aggregate_objects: bool = False
+    """Count the values of all agents in the same histogram, those of traffic lights excepted."""
 
     @property
     def histograms(self) -> tuple[HistogramConfig, ...]:
@@ -126,6 +155,11 @@ METRIC_2025 = MetricConfig(
 """The leaderboard of 2025."""
 
 
+METRIC_2025_SCENARIO_GEN = replace(
+    METRIC_2025, name="2025-scenario-gen", challenge=SCENARIO_GEN, aggregate_objects=True
+)
+"""The scenario generation leaderboard of 2025."""
+
 # Only two weights differ from 2025: the road edge counts twice as much, traffic lights do not count.
 METRIC_2024 = replace(
     METRIC_2025,
@@ -157,7 +191,10 @@ METRIC_2023 = MetricConfig(
 )
 """The weights and ranges of 2023. They sum to 0.99 as published; values are not comparable with later years."""
 
-METRICS = {config.name: config for config in (METRIC_2025, METRIC_2024, METRIC_2024_ORIGINAL, METRIC_2023)}
+METRICS = {
+    config.name: config
+    for config in (METRIC_2025, METRIC_2024, METRIC_2024_ORIGINAL, METRIC_2023, METRIC_2025_SCENARIO_GEN)
+}
 
 
 def metric_by_name(name: str) -> MetricConfig:

@@ -13,7 +13,7 @@ are not evaluated, and padding, have 0 there.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -121,7 +121,7 @@ def _compute_terms(log: AnyLog, features: Features, config: MetricConfig, sets: 
     """Terms of the agents in each feature's mean log-probability, under the selected sets of `form_sets`, nats."""
     target, table = likelihood.log_target(log, config), likelihood.histogram_table(config, features.linear_speed.device)
     counts, size = form_sets(likelihood.count_rollouts(features, log, config), features.repeat)
-    counts = likelihood.RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
+    counts = replace(counts, bins=counts.bins[sets].double(), agreement=counts.agreement[sets].double())
     by_agent = likelihood.compute_agent_log_likelihoods(counts, size[sets].double(), target, table)
     return by_agent / to_agents(likelihood.count_terms(target).double(), target.layout)
 

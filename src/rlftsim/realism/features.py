@@ -10,6 +10,7 @@ from typing import Literal
 from weakref import WeakValueDictionary
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from rlftsim.realism.agents import (
     join_history,
     join_trajectories,
 )
+from rlftsim.realism.config import SIM_AGENTS, Challenge
 from rlftsim.realism.interactive import PlanarAgents, compute_distance_to_nearest_object, compute_time_to_collision
 from rlftsim.realism.kinematic import (
     compute_displacement_error,
@@ -32,7 +34,7 @@ from rlftsim.realism.kinematic import (
 )
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge, join_road_edges
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation, join_signals
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario, cached_on_scenario
+from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, Scenario, cached_on_scenario
 
 MissingMap = Literal["error", "neutral"]
 
@@ -64,9 +66,10 @@ DEFAULT_COMPUTE = ComputeConfig()
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features of the evaluated agents at the 80 future steps, N rollouts (1 for the log); m, s, rad.
+    """Features of the evaluated agents at the simulated steps, N rollouts (1 for the log); m, s, rad.
 
-    Kinematic values are NaN at the last step (speeds) or last two (accelerations).
+    Kinematic values are NaN at the last step (speeds) or last two (accelerations), of generated scenes at the first,
+    too.
     """
 
     linear_speed: Float[Tensor, "N E T"]
@@ -80,7 +83,7 @@ class Features:
     """Negative on the road."""
     traffic_light_violation: Bool[Tensor, "N E T"]
     displacement_error: Float[Tensor, "N E"]
-    """Mean 3D distance to the log, see `compute_displacement_error`."""
+    """Mean 3D distance to the log, see `compute_displacement_error`; 0 for generated agents, which are nobody's."""
     valid: Bool[Tensor, "N E T"]
     """The log's own validity; True everywhere for rollouts."""
     repeat: int = 1
@@ -163,6 +166,7 @@ def scenario_log(
     *,
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
+    challenge: Challenge = SIM_AGENTS,
 ) -> ScenarioLog:
     """All that the metric computes from the scenario alone: agents, packed map, log features.
 
@@ -175,6 +179,7 @@ def scenario_log(
             counts log and rollouts as on the road. Under "neutral" a log in which no future state of an evaluated agent
             is valid raises no error, either: the scores are NaN.
         compute: Bound on the memory of the computation; changes no result.
+        challenge: Rules of the metric: evaluated agents and scored steps.
 
     Raises:
         DataError: No logged future, no evaluated agent, or no road edges.
@@ -182,10 +187,10 @@ def scenario_log(
     if isinstance(scenario, ScenarioLog):
         return scenario
     device = torch.device(device)
-    logs, key = _cached_logs(scenario), (device, missing_map, compute)
+    logs, key = _cached_logs(scenario), (device, missing_map, compute, challenge)
     log = logs.get(key)
     if log is None:
-        log = logs[key] = _build_log(scenario, device, missing_map, compute.pairs_on(device))
+        log = logs[key] = _build_log(scenario, device, missing_map, compute.pairs_on(device), challenge)
     # Most recently used last; what falls out in front is forgotten by `_cached_logs`, too.
     if log in _recent_logs:
         _recent_logs.remove(log)
@@ -202,8 +207,10 @@ def _cached_logs(scenario: Scenario) -> WeakValueDictionary[Hashable, ScenarioLo
     return WeakValueDictionary()
 
 
-def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap, max_pairs: int) -> ScenarioLog:
-    agents = build_logged_agents(scenario, device)
+def _build_log(
+    scenario: Scenario, device: torch.device, missing_map: MissingMap, max_pairs: int, challenge: Challenge
+) -> ScenarioLog:
+    agents = build_logged_agents(scenario, device, challenge)
     # Training goes on, where the reward counts as missing: its scores are NaN.
     if missing_map == "error" and not scenario.has_evaluated_future:
         raise DataError(
@@ -220,7 +227,7 @@ def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap
     # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.
     log = Trajectories(*(values[None] for values in agents.trajectories))
     with torch.no_grad():
-        features = _measure(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
+        features = _measure(log, agents.size[None], agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
     return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
 
 
@@ -236,18 +243,22 @@ def compute_features(
         compute: Bound on the memory of the computation; changes no result.
 
     Raises:
-        DataError: The agents of the rollouts are not the scenario's simulated agents.
+        DataError: The agents of the rollouts are not the scenario's simulated agents, or rollouts of another challenge.
     """
     states = [states] if isinstance(states, SimulatedStates) else states
     histories = [join_history(scene.agents, s, scene.scenario_id) for scene, s in zip(log.logs, states)]
-    trajectories = histories[0] if len(histories) == 1 else join_trajectories(histories)  # [N, A, 82]
+    trajectories, size = histories[0]  # [N, A, 82], [N, A, T, 3]
+    if len(histories) > 1:
+        trajectories = join_trajectories([history for history, _ in histories])
+        size = torch.cat([sizes for _, sizes in histories], 1)
     max_pairs = compute.pairs_on(states[0].device)
-    features = _measure(trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
+    features = _measure(trajectories, size, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
     return replace(features, repeat=states[0].repeat)
 
 
 def _measure(
     trajectories: Trajectories,
+    size: Float[Tensor, "#N A #T 3"],
     agents: LoggedAgents,
     road_edges: RoadEdges | None,
     signals: Signals | None,
@@ -255,32 +266,43 @@ def _measure(
     is_log: bool,
     max_pairs: int,
 ) -> Features:
-    """Features of trajectories [N, A, history + 80] with a history that ends with the current step."""
-    evaluated = trajectories.select_agents(agents.evaluated)  # [N, E, history + 80]
-    future = evaluated.from_step(-FUTURE_STEPS)  # [N, E, 80]
+    """Features of trajectories [N, A, history + T] with a history that ends with the current step, if any."""
+    num_steps = agents.challenge.num_steps
+    evaluated = trajectories.select_agents(agents.evaluated)  # [N, E, history + T]
+    future = evaluated.from_step(-num_steps)  # [N, E, T]
     # Rollouts count as valid at every step, wherever the log is.
     valid = agents.future_valid if is_log else torch.ones_like(agents.future_valid)
     valid = valid.expand(future.x.shape)
     # 1. Kinematics need the history for their differences; the rest is cut to the future.
     kinematics = compute_kinematics((evaluated.x, evaluated.y, evaluated.z), evaluated.heading)
     # 2. Other agents.
-    nearest, time_to_collision = _compute_interaction(trajectories, agents, is_log=is_log, max_pairs=max_pairs)
-    # 3. Traffic lights: a crossing at the first future step compares with the current step.
-    with_current = evaluated.from_step(-FUTURE_STEPS - 1)
+    # The log of a scene counts as present where it is not: what the file stores there is in the way of the others.
+    masks_log = is_log and not agents.challenge.makes_scenes
+    nearest, time_to_collision = _compute_interaction(trajectories, size, agents, masks_log, max_pairs=max_pairs)
+    # 3. Traffic lights: a crossing at the first future step compares with the current step. A scene's first step has
+    #    no step before, and none is crossed there.
+    with_current = evaluated.from_step(-num_steps - 1)
     violation = torch.zeros_like(valid)
     if signals is not None:
+        first_step = TOTAL_STEPS - with_current.x.shape[-1]
         violation = compute_traffic_light_violation(
-            with_current.x, with_current.y, valid, signals, first_step=HISTORY_STEPS - 1, max_pairs=max_pairs,
-            scenario=None if agents.layout is None else agents.layout.scenario,
+            with_current.x, with_current.y, valid[..., 1 - with_current.x.shape[-1] :], signals, first_step=first_step,
+            max_pairs=max_pairs, scenario=None if agents.layout is None else agents.layout.scenario,
         )  # fmt: skip
+        violation = F.pad(violation, (num_steps - violation.shape[-1], 0))
     # 4. Displacement from the log.
-    logged = agents.trajectories.select_agents(agents.evaluated).from_step(-FUTURE_STEPS)
-    displacement = compute_displacement_error(future, logged, agents.valid.index_select(0, agents.evaluated))
+    if agents.challenge.makes_scenes:
+        displacement = future.x.new_zeros(future.x.shape[:2])
+    else:
+        logged = agents.trajectories.select_agents(agents.evaluated).from_step(-num_steps)
+        displacement = compute_displacement_error(future, logged, agents.valid.index_select(0, agents.evaluated))
     return Features(
-        **{name: values[..., -FUTURE_STEPS:] for name, values in kinematics._asdict().items()},
+        **{name: values[..., -num_steps:] for name, values in kinematics._asdict().items()},
         distance_to_nearest_object=nearest,
         time_to_collision=time_to_collision,
-        distance_to_road_edge=_compute_road_edge(future, agents, road_edges, valid, max_pairs),
+        distance_to_road_edge=_compute_road_edge(
+            future, size.index_select(1, agents.evaluated), agents, road_edges, valid, max_pairs
+        ),
         traffic_light_violation=violation,
         displacement_error=displacement,
         valid=valid,
@@ -288,18 +310,26 @@ def _measure(
 
 
 def _compute_interaction(
-    trajectories: Trajectories, agents: LoggedAgents, *, is_log: bool, max_pairs: int
+    trajectories: Trajectories,
+    size: Float[Tensor, "#N A #T 3"],
+    agents: LoggedAgents,
+    masks_log: bool,
+    *,
+    max_pairs: int,
 ) -> tuple[Float[Tensor, "N E T"], Float[Tensor, "N E T"]]:
     """Distance to the nearest object and time to collision, some rollouts at a time."""
-    speed = compute_ground_speed(trajectories.x, trajectories.y)[..., -FUTURE_STEPS:]
-    future = trajectories.from_step(-FUTURE_STEPS)
+    num_steps = agents.challenge.num_steps
+    speed = compute_ground_speed(trajectories.x, trajectories.y)[..., -num_steps:]
+    future = trajectories.from_step(-num_steps)
     neighbors, mask = (agents.layout.neighbors, agents.layout.neighbor_mask) if agents.layout else (None, None)
     num_neighbors = len(agents.object_id) if neighbors is None else neighbors.shape[1]
-    chunk_size = max(1, max_pairs // (num_neighbors * len(agents.evaluated) * FUTURE_STEPS))
-    log_valid = agents.valid[None, :, -FUTURE_STEPS:] if is_log else None  # [1, A, 80]
-    length, width = agents.size[:, 0], agents.size[:, 1]
+    chunk_size = max(1, max_pairs // (num_neighbors * len(agents.evaluated) * num_steps))
+    log_valid = agents.valid[None, :, -num_steps:] if masks_log else None  # [1, A, T]
+    size = size.expand(len(speed), -1, -1, -1)
     distances, seconds = [], []
-    for x, y, heading, chunk_speed in zip(*(v.split(chunk_size) for v in (future.x, future.y, future.heading, speed))):
+    arrays = (future.x, future.y, future.heading, size, speed)
+    for x, y, heading, box_size, chunk_speed in zip(*(values.split(chunk_size) for values in arrays)):
+        length, width, _ = box_size.unbind(-1)
         boxes = PlanarAgents(x, y, heading, length, width, agents.evaluated, log_valid, neighbors, mask)
         distances.append(compute_distance_to_nearest_object(boxes))
         seconds.append(compute_time_to_collision(boxes, chunk_speed))
@@ -307,11 +337,15 @@ def _compute_interaction(
 
 
 def _compute_road_edge(
-    future: Trajectories, agents: LoggedAgents, edges: RoadEdges | None, valid: Bool[Tensor, "N E T"], max_pairs: int
+    future: Trajectories,
+    size: Float[Tensor, "#N E #T 3"],
+    agents: LoggedAgents,
+    edges: RoadEdges | None,
+    valid: Bool[Tensor, "N E T"],
+    max_pairs: int,
 ) -> Float[Tensor, "N E T"]:
     if edges is None:
         return torch.full_like(future.x, INVALID_ROAD_EDGE_M)
-    size = agents.size.index_select(0, agents.evaluated)
     # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
     # the current position instead; their distance is overwritten below.
     current = agents.trajectories.select_agents(agents.evaluated)

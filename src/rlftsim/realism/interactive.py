@@ -36,8 +36,8 @@ class PlanarAgents(NamedTuple):
     x: Float[Tensor, "N A T"]
     y: Float[Tensor, "N A T"]
     heading: Float[Tensor, "N A T"]
-    length: Float[Tensor, "A"]
-    width: Float[Tensor, "A"]
+    length: Float[Tensor, "#N A #T"]
+    width: Float[Tensor, "#N A #T"]
     evaluated: Int64[Tensor, "E"]
     valid: Bool[Tensor, "N A T"] | None = None
     """None: all agents are valid at every step."""
@@ -49,10 +49,6 @@ class PlanarAgents(NamedTuple):
     def to_neighbors(self, values: Tensor) -> Tensor:
         """Values of each evaluated agent's neighbors at each step: [N, A, T] to [N, E, K, T]; E = 1 if shared."""
         return values[:, None] if self.neighbors is None else values[:, self.neighbors]
-
-    def size_to_neighbors(self, values: Float[Tensor, "A"]) -> Tensor:
-        """Constant values of each evaluated agent's neighbors: [A] to [E, K, 1]; [K, 1] if shared."""
-        return (values if self.neighbors is None else values[self.neighbors])[..., None]
 
     def mask_pairs(self, values: Tensor, fill: float | bool) -> None:
         """Fill values [N, E, K, T] in place where no pair exists: of an agent and the agent itself, and of padding."""
@@ -71,7 +67,6 @@ class _Pairs(NamedTuple):
     """Flat index of (rollout, agent, step) of the evaluated agent."""
     neighbor: Int64[Tensor, "P"]
     """Flat index of (rollout, agent, step) of the neighbor."""
-    ego_agent: Int64[Tensor, "P"]
     neighbor_agent: Int64[Tensor, "P"]
 
 
@@ -81,12 +76,10 @@ def _list_pairs(mask: Bool[Tensor, "N E K T"], agents: PlanarAgents) -> _Pairs:
     num_evaluated = len(agents.evaluated)
     rollout, rank, neighbor, step = mask.nonzero().unbind(-1)
     neighbor = neighbor if agents.neighbors is None else agents.neighbors[rank, neighbor]
-    ego = agents.evaluated[rank]
     return _Pairs(
         row=(rollout * num_evaluated + rank) * num_steps + step,
-        ego=(rollout * num_agents + ego) * num_steps + step,
+        ego=(rollout * num_agents + agents.evaluated[rank]) * num_steps + step,
         neighbor=(rollout * num_agents + neighbor) * num_steps + step,
-        ego_agent=ego,
         neighbor_agent=neighbor,
     )
 
@@ -108,21 +101,21 @@ def _find_nearest_candidates(agents: PlanarAgents) -> _Pairs:
     if agents.valid is not None:
         center_distance.masked_fill_(~agents.to_neighbors(agents.valid), torch.inf)
     # 3. Candidates: their lower bound does not exceed the smallest upper bound of the row.
-    slack = (outer - inner)[agents.evaluated] + BOUND_SLACK_M
+    slack = (outer - inner)[:, agents.evaluated] + BOUND_SLACK_M
     # A row without any pair is all infinite, and inf <= inf must not pass: its bound becomes the largest finite number.
-    bound = (center_distance - agents.size_to_neighbors(inner)).amin(2) + slack[:, None]  # [N, E, T]
+    bound = (center_distance - agents.to_neighbors(inner)).amin(2) + slack  # [N, E, T]
     bound.clamp_(max=torch.finfo(bound.dtype).max)
-    mask = (center_distance - agents.size_to_neighbors(outer)) <= bound[:, :, None]
+    mask = (center_distance - agents.to_neighbors(outer)) <= bound[:, :, None]
     if agents.valid is not None:
         mask &= agents.valid[:, agents.evaluated, None]
     return _list_pairs(mask, agents)
 
 
 def _compute_core_corners(
-    agents: PlanarAgents, state: Int64[Tensor, "P"], agent: Int64[Tensor, "P"]
+    agents: PlanarAgents, state: Int64[Tensor, "P"]
 ) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"], Float[Tensor, "P"]]:
     """World x and y of the corners of the cores (boxes less the rounding), counter-clockwise, and the rounding."""
-    length, width = agents.length[agent], agents.width[agent]
+    length, width = (values.expand_as(agents.x).reshape(-1)[state] for values in (agents.length, agents.width))
     rounding = CORNER_ROUNDING * torch.minimum(length, width) / 2
     half_length, half_width = (length - 2 * rounding) / 2, (width - 2 * rounding) / 2
     heading = agents.heading.reshape(-1)[state]
@@ -177,8 +170,8 @@ def _compute_box_distance(agents: PlanarAgents, pairs: _Pairs) -> Float[Tensor, 
     """Signed distance between rounded boxes, m, negative for overlap."""
     # Two rounded boxes are as far apart as their cores, less both roundings. The distance of two convex shapes is that
     # of the origin to their Minkowski difference.
-    ego_x, ego_y, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
-    x, y, rounding = _compute_core_corners(agents, pairs.neighbor, pairs.neighbor_agent)
+    ego_x, ego_y, ego_rounding = _compute_core_corners(agents, pairs.ego)
+    x, y, rounding = _compute_core_corners(agents, pairs.neighbor)
     return _compute_origin_distance(*_add_rectangles((ego_x, ego_y), (-x, -y))) - ego_rounding - rounding
 
 
@@ -208,11 +201,11 @@ def _find_follow_candidates(agents: PlanarAgents, speed: Float[Tensor, "N A T"])
     dy = agents.to_neighbors(agents.y) - agents.y[:, agents.evaluated, None]
     forward = dx * cos + dy * sin
     lateral = dy.mul_(cos).sub_(dx.mul_(sin)).abs_()
-    reach = TIME_HORIZON_S * speed[:, agents.evaluated] * 1.001 + (outer[agents.evaluated] + BOUND_SLACK_M)[:, None]
-    half_width = (agents.width[agents.evaluated] / 2 + BOUND_SLACK_M)[:, None]  # [E, 1]
+    reach = TIME_HORIZON_S * speed[:, agents.evaluated] * 1.001 + (outer[:, agents.evaluated] + BOUND_SLACK_M)
+    half_width = agents.width[:, agents.evaluated] / 2 + BOUND_SLACK_M
     # A speed of NaN (first and last step of a log) fails the comparison, as it does in the official rule.
-    mask = (forward - agents.size_to_neighbors(outer) <= reach[:, :, None]) & (forward > 0)
-    mask &= lateral < half_width[:, :, None] + agents.size_to_neighbors(outer)
+    mask = (forward - agents.to_neighbors(outer) <= reach[:, :, None]) & (forward > 0)
+    mask &= lateral < half_width[:, :, None] + agents.to_neighbors(outer)
     agents.mask_pairs(mask, False)
     if agents.valid is not None:
         mask &= agents.to_neighbors(agents.valid)
@@ -227,13 +220,13 @@ def _compute_gaps(agents: PlanarAgents, pairs: _Pairs) -> tuple[Float[Tensor, "P
     turn = (heading[pairs.neighbor] - ego_heading).abs()
     cos, sin = ego_heading.cos(), ego_heading.sin()
     dx, dy = x[pairs.neighbor] - x[pairs.ego], y[pairs.neighbor] - y[pairs.ego]
-    half_length, half_width = agents.length / 2, agents.width / 2
+    half_length, half_width = ((v / 2).expand_as(agents.x).reshape(-1) for v in (agents.length, agents.width))
     # Half extent of the neighbor's box along and across the ego's heading.
     turn_cos, turn_sin = turn.cos().abs(), turn.sin().abs()
-    half_depth = half_length[pairs.neighbor_agent] * turn_cos + half_width[pairs.neighbor_agent] * turn_sin
-    half_breadth = half_length[pairs.neighbor_agent] * turn_sin + half_width[pairs.neighbor_agent] * turn_cos
-    gap = (dx * cos + dy * sin) - half_length[pairs.ego_agent] - half_depth
-    lateral_gap = (dy * cos - dx * sin).abs() - half_width[pairs.ego_agent] - half_breadth
+    half_depth = half_length[pairs.neighbor] * turn_cos + half_width[pairs.neighbor] * turn_sin
+    half_breadth = half_length[pairs.neighbor] * turn_sin + half_width[pairs.neighbor] * turn_cos
+    gap = (dx * cos + dy * sin) - half_length[pairs.ego] - half_depth
+    lateral_gap = (dy * cos - dx * sin).abs() - half_width[pairs.ego] - half_breadth
     is_followed = (gap > 0) & (turn <= MAX_HEADING_DIFFERENCE) & (lateral_gap < 0)
     is_followed &= (lateral_gap < -SMALL_OVERLAP_M) | (turn <= SMALL_HEADING_DIFFERENCE)
     return gap, is_followed

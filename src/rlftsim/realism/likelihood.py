@@ -166,11 +166,14 @@ def log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
 class RolloutCounts:
     """Counts of each rollout; the counts of a set of rollouts are the sum over the members."""
 
-    bins: Float[Tensor, "N H E K"]
+    bins: Float[Tensor, "N H #E K"]
+    """E is 1 where all agents share a histogram."""
     agreement: Float[Tensor, "N J E"]
-    """1 where the rollout has the log's outcome."""
+    """1 where the rollout has the log's outcome; where all agents share a histogram, the number of agents that have."""
     num_steps: int
-    """Values per rollout and agent, T."""
+    """Values per rollout in a histogram: T steps of an agent, or of all agents."""
+    num_outcomes: tuple[int, ...] = (1, 1, 1)
+    """Outcomes per rollout of each Bernoulli feature: that of an agent, or those of all agents."""
 
 
 def count_rollouts(features: Features, log: AnyLog, config: MetricConfig) -> RolloutCounts:
@@ -183,8 +186,16 @@ def count_rollouts(features: Features, log: AnyLog, config: MetricConfig) -> Rol
     """
     values = stack_histogram_features(features)
     table = histogram_table(config, values.device)
-    agreement = compute_outcomes(features, log) == log_target(log, config).outcome
-    return RolloutCounts(count_bins(values, table), agreement.to(values.dtype), values.shape[-1])
+    bins, num_steps = count_bins(values, table), values.shape[-1]
+    outcome, logged = compute_outcomes(features, log), log_target(log, config).outcome
+    agreement = (outcome == logged).to(values.dtype)
+    if not config.aggregate_objects:
+        return RolloutCounts(bins, agreement, num_steps)
+    # Light violations, the last feature, are counted agent by agent all the same.
+    num_agents = logged.shape[-1]
+    num_agreeing = (outcome[:, :-1, None] == logged[:-1, :, None]).sum(-1)  # [N, J - 1, E]
+    agreement = torch.cat([num_agreeing.to(values.dtype), agreement[:, -1:]], 1)
+    return RolloutCounts(bins.sum(2, keepdim=True), agreement, num_steps * num_agents, (num_agents, num_agents, 1))
 
 
 def compute_log_probabilities(
@@ -196,7 +207,7 @@ def compute_log_probabilities(
 
     Args:
         counts: Number of values in each bin, for each of S sets of rollouts.
-        num_values: Number of values in each histogram: rollouts times steps.
+        num_values: Number of values in each histogram: rollouts times steps, times agents that share the histogram.
         table: Bins of the metric, with the pseudocounts.
     """
     pseudocount = table.pseudocount[:, None, None]
@@ -220,8 +231,9 @@ def compute_agent_log_likelihoods(
     log_probability = compute_log_probabilities(counts.bins, num_rollouts * counts.num_steps, table)
     histogram = (log_probability * target.steps_in_bin).sum(-1)  # [S, H, E]
     pseudocount = table.bernoulli_pseudocount
-    # Two outcomes: (number that agree + c) / (number of rollouts + 2 c).
-    agreement = (counts.agreement + pseudocount[:, None]) / (num_rollouts[:, None] + 2 * pseudocount)[..., None]
+    # Two outcomes: (number that agree + c) / (number of outcomes + 2 c).
+    num_outcomes = torch.stack([num_rollouts * number for number in counts.num_outcomes], -1)  # [S, J]
+    agreement = (counts.agreement + pseudocount[:, None]) / (num_outcomes + 2 * pseudocount)[..., None]
     return torch.cat([histogram, agreement.log_()], dim=1)
 
 

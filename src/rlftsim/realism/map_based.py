@@ -201,7 +201,7 @@ def compute_point_distance_to_road_edge(
 
 def compute_distance_to_road_edge(
     agents: Trajectories,
-    size: Float[Tensor, "E 3"],
+    size: Float[Tensor, "*#steps 3"],
     edges: RoadEdges,
     *,
     max_pairs: int,
@@ -211,12 +211,12 @@ def compute_distance_to_road_edge(
 
     Args:
         agents: States of the evaluated agents, [N, E, T].
-        size: Length, width, height of the boxes, m.
+        size: Length, width, height of the boxes, m: [E, 1, 3] at all steps, or [N, E, T, 3].
         edges: Road edges of the scenario, or of several side by side.
         max_pairs: Bound on the point-segment pairs in memory; changes no result.
         scenario: Scenario of each agent, where the edges are those of several scenarios.
     """
-    half_length, half_width, half_height = (size / 2)[:, :, None].unbind(1)  # [E, 1] each
+    half_length, half_width, half_height = (size / 2).unbind(-1)  # [E, 1] each
     box_x = torch.stack([half_length, -half_length, -half_length, half_length], -1)  # [E, 1, 4]
     box_y = torch.stack([half_width, half_width, -half_width, -half_width], -1)
     cos, sin = agents.heading.cos()[..., None], agents.heading.sin()[..., None]

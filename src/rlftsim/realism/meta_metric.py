@@ -9,14 +9,14 @@ grow with the number of scenarios.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.realism.agents import SimulatedStates, mean_over_agents, sum_over_agents
 from rlftsim.realism.config import (
     FEATURE_NAMES,
@@ -129,10 +129,10 @@ def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[
     """
     # Counts are whole numbers below 2^24: sums and differences are exact in float32.
     totals = [values.sum(0, keepdim=True) * repeat for values in (counts.bins, counts.agreement)]
-    sets = RolloutCounts(
+    sets = replace(
+        counts,
         bins=torch.cat([totals[0], totals[0] - counts.bins, counts.bins]),
         agreement=torch.cat([totals[1], totals[1] - counts.agreement, counts.agreement]),
-        num_steps=counts.num_steps,
     )
     size = counts.bins.new_ones(len(sets.bins))
     size[0] = len(counts.bins) * repeat
@@ -158,6 +158,11 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
         features: Features of the N distinct rollouts, from `compute_features`.
         config: Year of the metric: bins, weights and rules.
     """
+    if config.challenge != log.agents.challenge:
+        raise ConfigError(
+            f"metric {config.name} scores {config.challenge.title}: take a metric of {log.agents.challenge.title}, or "
+            "`rlftsim evaluate`, which makes the rollouts that its metric wants."
+        )
     num_distinct, repeat = len(features.linear_speed), features.repeat
     # 1. Likelihoods of all sets of rollouts at once.
     sets, size = form_sets(count_rollouts(features, log, config), repeat)
@@ -218,7 +223,7 @@ def score(
     Raises:
         DataError: The scenario cannot be scored, or the agents of the rollouts are not the simulated agents.
     """
-    log = scenario_log(scenario, states.device, missing_map=missing_map, compute=compute)
+    log = scenario_log(scenario, states.device, missing_map=missing_map, compute=compute, challenge=config.challenge)
     return score_features(log, compute_features(log, states, compute=compute), config)
 
 

@@ -9,12 +9,11 @@ needed.
 """
 
 import re
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property, wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, get_args, runtime_checkable
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64, Shaped
@@ -441,6 +440,9 @@ class Scenario:
         """Center of the *map* frame: ego position at the current step in whole meters, float64, world frame."""
         return np.round(self.tracks.position[self.ego_index, CURRENT_STEP, :2].astype(np.float64))
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # without what is cached
+
     def __repr__(self) -> str:
         types = self.tracks.object_type[self.simulated_indices]
         counts = [(int((types == t).sum()), t.name.lower()) for t in ObjectType]
@@ -545,6 +547,7 @@ def list_scenario_ids(scenarios: Scenarios) -> Iterable[str]:
     return scenario_ids if scenario_ids is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))
 
 
+_CACHE = "_cached_values"
 Value = TypeVar("Value")
 Arguments = ParamSpec("Arguments")
 
@@ -554,15 +557,13 @@ def cached_on_scenario(
 ) -> Callable[Concatenate[Scenario, Arguments], Value]:
     """Decorator that caches a function of a scenario, and of further hashable arguments, with the scenario.
 
-    The values are dropped together with the scenario.
+    The values are dropped together with the scenario, also those that refer to the scenario.
     """
-    # weak keys: the cache must not keep a scenario in memory that its data set has dropped
-    cache: WeakKeyDictionary[Scenario, dict[Hashable, Value]] = WeakKeyDictionary()
 
     @wraps(compute)
     def remembered(scenario: Scenario, *arguments: Arguments.args, **named: Arguments.kwargs) -> Value:
-        values = cache.setdefault(scenario, {})
-        key = (arguments, tuple(named.items()))
+        values = scenario.__dict__.setdefault(_CACHE, {})
+        key = (compute, arguments, tuple(named.items()))
         if key not in values:
             values[key] = compute(scenario, *arguments, **named)
         return values[key]

@@ -1,4 +1,4 @@
-"""Archives for the Sim Agents challenge: simulate a split shard by shard, pack, check.
+"""Archives for the challenges of the Waymo Open Dataset: simulate a split shard by shard, pack, check.
 
     OUT/plan.json                all that the shards depend on; any other plan is refused
     OUT/shards/00003.part        a finished shard, compressed (`submission.archive`)
@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim.errors import DataError
-from rlftsim.evaluation.evaluate import simulate_states
+from rlftsim.evaluation.rollout_states import simulate_evaluated
 from rlftsim.jobs.files import errors_name, remove_folder, remove_temporaries, temporary_path, write_text
 from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.items import ResultFormat, run_items
@@ -154,9 +154,9 @@ def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[
 def _simulate_message(job: Job, position: int, shard: str) -> bytes:
     """Serialized rollouts of a scenario for the archive, checked."""
     scenario = job.data[position]
-    states = simulate_states(job.policy, collate([scenario]).to(get_device(job.policy)), job.config)
-    message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
-    for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
+    states = round_states(simulate_evaluated(job.policy, collate([scenario]), job.config), job.round_m)
+    message = encode_rollouts(scenario.scenario_id, states, scenario.tracks.object_type[scenario.simulated_indices])
+    for finding in check_rollouts(decode_rollouts(message), scenario, shard, job.config.challenge).findings:
         if finding.severity == "error":
             raise DataError(f"check {finding.check}: {finding}. Nothing of this shard is kept.")
     return message

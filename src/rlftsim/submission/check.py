@@ -17,6 +17,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.evaluation.wire_format import BYTES, read_fields
 from rlftsim.jobs.progress import progress_bar
+from rlftsim.realism import SIM_AGENTS, Challenge
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import GzipReader
@@ -67,6 +68,7 @@ def check_archive(
     *,
     sample: float = 1.0,
     expected_sha256: str | None = None,
+    challenge: Challenge = SIM_AGENTS,
     callback: RolloutsCallback | None = None,
     show_progress: bool = True,
 ) -> ArchiveCheck:
@@ -79,6 +81,7 @@ def check_archive(
         data: Scenarios of the split that the archive is for; None makes only the checks that need no data set.
         sample: Fraction of scenarios with a look at the trajectories; names, fields and sets are always checked.
         expected_sha256: Checksum of the file that was built; None = not compared.
+        challenge: Challenge that the archive is for.
         callback: Function of a scenario and the rollouts, called for trajectories without an error.
         show_progress: False shows no progress bar.
 
@@ -94,7 +97,7 @@ def check_archive(
     if not archive.is_file():
         raise DataError(f"{archive}: there is no such archive.")
     check = ArchiveCheck(archive.name, archive.stat().st_size)
-    archive_pass = _Pass(check, data, sample, callback)
+    archive_pass = _Pass(check, data, sample, callback, challenge)
     if SPLIT_NAME.fullmatch(archive.name):
         joined = archive.name.rpartition(".")[0]
         archive_pass.add(17, f"a part of an archive: join the parts first, cat {joined}.??? > {joined}")
@@ -118,6 +121,7 @@ class _Pass:
     data: ScenarioDataset | None
     sample: float
     callback: RolloutsCallback | None
+    challenge: Challenge
     scenario_ids: set[str] = field(default_factory=set)
     numbers: list[tuple[int, int]] = field(default_factory=list)
     """Number and count in the names of shards."""
@@ -207,7 +211,7 @@ class _Pass:
         except DataError as error:
             self.data_error = error
             raise
-        scenario_check = check_rollouts(decoded, scenario, file)
+        scenario_check = check_rollouts(decoded, scenario, file, self.challenge)
         self.check.num_checked += 1
         self.check.num_trajectories += scenario_check.num_agents
         self.check.num_jumps += scenario_check.num_jumps

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.jobs.documents import read_toml
+from rlftsim.realism import SIM_AGENTS, Challenge
 from rlftsim.rollout.check import POSE_TOLERANCE_M
 from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.noise import draw_noise
@@ -181,13 +182,18 @@ def _is_placeholder(text: str) -> bool:
     return has_mark or lower in _PLACEHOLDERS
 
 
-def statement(policy: Policy, sampling: Sampling) -> str:
+def statement(policy: Policy, sampling: Sampling, challenge: Challenge = SIM_AGENTS) -> str:
     """Statement that an entry makes with the closed-loop flag, as far as this code can vouch for the policy.
 
     Args:
         policy: Policy whose rollouts are submitted; gives the seconds between decisions.
         sampling: Temperature and truncation of the submitted rollouts, quoted in the statement.
+        challenge: Challenge of the entry.
     """
+    knowledge = "it sees the log up to the current step only: no future, no goals;"
+    if challenge.makes_scenes:
+        knowledge = """agents but the ego begin at states drawn from the lanes, by number and type alone: of the log it
+  sees the map, the lights up to the current step and the ego's past, and nothing of the others;"""
     stride = policy.steps_per_decision
     sampling = getattr(policy, "sampling", Sampling()).narrow(sampling)
     limit = "" if sampling.top_k is None else f", top {sampling.top_k}"
@@ -196,7 +202,7 @@ the preceding states, made at least once a second. The ego's next state must be 
 given the past. How these rollouts are made:
 * the policy decides every {stride * STEP_S:g} s, {FUTURE_STEPS // stride} times in 8 s, from the states so far;
 * every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{limit});
-* it sees the log up to the current step only: no future, no goals;
+* {knowledge}
 * nothing drawn at the start of a rollout is shared by the ego and other agents;
 * every rollout that is drawn is submitted: none is selected, repaired or drawn again by its outcome.
 The code makes sure of the first and the last three points. That the policy itself draws agents independently is

@@ -1,7 +1,7 @@
 """Problems that are found in an archive, by the number of the check, and the checks of a scenario against the log.
 
 `submit build` checks a scenario before it is appended, `submit check` on the finished archive: numbers 1, 3, 4, 8 and
-10 to 14 of `CHECKS`.
+10 to 14, 19 and 20 of `CHECKS`.
 """
 
 from collections import Counter
@@ -9,9 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float32
+
 from rlftsim.errors import shorten
 from rlftsim.evaluation.rollout_checks import MAX_FIRST_STEP_ERROR_M, PoseChecks
-from rlftsim.scenario.types import Scenario
+from rlftsim.evaluation.rollout_files import AXES
+from rlftsim.realism import SIM_AGENTS, Challenge
+from rlftsim.scenario.types import HISTORY_STEPS, Scenario
 from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
 Severity = Literal["error", "warning"]
@@ -20,7 +25,7 @@ CHECKS = {
     1: "agents of every scene are those valid at step 10",
     2: "scenarios are those of the split",
     3: "32 scenes per scenario",
-    4: "80 steps per agent",
+    4: "80 steps per agent, or 91 of a generated one",
     5: "required fields, the same in every shard",
     6: "names and numbers of the shards",
     7: "a whole .tar.gz that Python's tarfile reads",
@@ -34,8 +39,12 @@ CHECKS = {
     15: "object ids of this version of the data",
     16: "sizes of shards and archive",
     17: "the file that was built, unbroken",
+    19: "sizes at 91 steps, and a type, of every generated agent",
+    20: "no generated agent repeats the log's history",
 }
 """Title of each check. The 18th of docs/submission.md, a server error without a reason, cannot be checked."""
+SAME_M = 1e-3
+"""A generated agent this near to its log at every logged step of the history repeats it."""
 _CHECK_OF_SUBJECT = {"not finite": 10, "distance": 10, "heading": 11, "turn": 11, "height": 12, "equal": 14}
 """The first step, 13, is judged over all scenarios."""
 MAX_STORED = 10
@@ -113,18 +122,22 @@ class ScenarioCheck:
     """Trajectories with a first step away from constant velocity."""
 
 
-def check_rollouts(decoded: DecodedRollouts, scenario: Scenario, file: str) -> ScenarioCheck:
+def check_rollouts(
+    decoded: DecodedRollouts, scenario: Scenario, file: str, challenge: Challenge = SIM_AGENTS
+) -> ScenarioCheck:
     """Findings of the comparison of a scenario's rollouts with the log.
 
     Args:
         decoded: Rollouts as read from the message.
         scenario: Scenario with the log up to the current step; a future is not read.
         file: Name of the shard, for the findings.
+        challenge: Challenge that the archive is for.
     """
-    findings = list(_structure(decoded, scenario, file))
+    findings = list(_structure(decoded, scenario, file, challenge))
     if findings or decoded.values is None:
         return ScenarioCheck(tuple(findings))
-    checks = PoseChecks(decoded.object_ids[0], decoded.values, scenario)
+    poses = decoded.values[:, :, : len(AXES)]
+    checks = PoseChecks(decoded.object_ids[0], poses, scenario)
     for doubt in checks.doubts():
         text = doubt.text if doubt.rollout is None else f"{doubt.text} in scene {doubt.rollout}"
         severity = "error" if doubt.is_impossible else "warning"
@@ -132,18 +145,48 @@ def check_rollouts(decoded: DecodedRollouts, scenario: Scenario, file: str) -> S
         findings.append(Finding(check, severity, text, file, decoded.scenario_id, doubt.object_id))
         if doubt.subject == "not finite":
             return ScenarioCheck(tuple(findings))
+    if challenge.makes_scenes:
+        findings += _find_history(decoded.object_ids[0], poses, scenario, file)
+        return ScenarioCheck(tuple(findings), poses.shape[0] * poses.shape[1])
     error = checks.first_step_errors()
     return ScenarioCheck(tuple(findings), error.size, int((error > MAX_FIRST_STEP_ERROR_M).sum()))
 
 
-def _structure(decoded: DecodedRollouts, scenario: Scenario, file: str) -> Iterator[Finding]:
-    """Scenes, agents and steps: 1, 3, 4 and 8."""
+def _find_history(
+    object_ids: tuple[int, ...], poses: Float32[np.ndarray, "N A 4 T"], scenario: Scenario, file: str
+) -> Iterator[Finding]:
+    """Agents that repeat the history of their log, which the challenge does not let a model read: 20."""
+    tracks = scenario.tracks
+    rows = [int(np.flatnonzero(tracks.object_id == object_id)[0]) for object_id in object_ids]
+    valid = tracks.valid[rows, :HISTORY_STEPS]  # [A, S]
+    logged = np.moveaxis(tracks.position[rows, :HISTORY_STEPS, :2], -1, 1)  # [A, 2, S]
+    gap = np.linalg.norm(poses[:, :, :2, :HISTORY_STEPS] - logged, axis=2)  # [N, A, S]
+    repeats = ((gap <= SAME_M) | ~valid).all(-1).any(0) & (np.array(rows) != scenario.ego_index)  # [A]
+    if repeats.any():
+        text = f"{repeats.sum()} of {len(rows) - 1} agents repeat their logged history, which must not be read"
+        yield Finding(20, "warning", text, file, scenario.scenario_id, object_ids[int(repeats.argmax())])
+
+
+def _structure(decoded: DecodedRollouts, scenario: Scenario, file: str, challenge: Challenge) -> Iterator[Finding]:
+    """Scenes, agents, steps, sizes and types: 1, 3, 4, 8 and 19."""
     name = decoded.scenario_id
+    if decoded.challenge != challenge:
+        steps = f"{challenge.num_steps} steps" + (" with sizes and a type" if challenge.makes_scenes else "")
+        text = f"agents are laid out as for {decoded.challenge.title}, {challenge.title} wants {steps}"
+        yield Finding(4, "error", f"{text}: name it with --challenge {decoded.challenge.name}", file, name)
+        return
     if len(decoded.object_ids) != NUM_SCENES:
         yield Finding(3, "error", f"{len(decoded.object_ids)} scenes instead of {NUM_SCENES}", file, name)
     for agent in decoded.wrong_lengths[:1]:
-        text = f"x, y, z and heading have {list(agent.lengths)} steps in scene {agent.scene}"
-        yield Finding(4, "error", text, file, name, agent.object_id)
+        sizes = agent.lengths[len(AXES) :]
+        text = f"x, y, z and heading have {list(agent.lengths[: len(AXES)])} steps in scene {agent.scene}"
+        if set(agent.lengths[: len(AXES)]) != {challenge.num_steps}:
+            yield Finding(4, "error", text, file, name, agent.object_id)
+        if set(sizes) - {challenge.num_steps}:
+            text = f"width, length and height have {list(sizes)} steps in scene {agent.scene}"
+            yield Finding(19, "error", text, file, name, agent.object_id)
+    if not decoded.has_types:
+        yield Finding(19, "error", "an agent has no object_type", file, name)
     expected = frozenset(scenario.tracks.object_id[scenario.simulated_indices].tolist())
     for scene, ids in enumerate(decoded.object_ids):
         if scene and ids == decoded.object_ids[scene - 1]:

@@ -13,6 +13,7 @@ from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.folder import find_differences, write_identity
+from rlftsim.realism import SIM_AGENTS, Challenge
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy
 from rlftsim.rollout.simulate import check_sampling
@@ -20,7 +21,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.submission.archive import PackedShard
 from rlftsim.submission.entry import Entry, check_closed_loop, count_parameters, describe_entry
-from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES
+from rlftsim.submission.messages import NUM_SCENES, count_bytes
 
 FORMAT = "rlftsim-submission-1"
 PLAN, SHARDS = "plan.json", "shards"
@@ -38,6 +39,7 @@ class Plan:
     """Simulated agents of each shard."""
     identity: Mapping[str, object]
     """Plain values that a folder's earlier work must agree with to be continued."""
+    challenge: Challenge = SIM_AGENTS
 
     def shard_name(self, number: int) -> str:
         """Name of a shard in the archive, in the challenge's form."""
@@ -46,7 +48,7 @@ class Plan:
     @property
     def message_bytes(self) -> int:
         """Forecast of the uncompressed size."""
-        return sum(self.num_agents) * NUM_SCENES * TRAJECTORY_BYTES
+        return sum(self.num_agents) * NUM_SCENES * count_bytes(self.challenge)
 
     def claim(self, folder: Path) -> None:
         """Write the plan into a folder, or compare the plan with the stored plan.
@@ -103,6 +105,7 @@ def make_plan(
     shards = tuple(range(first, stop) for first, stop in pairwise(borders))
     identity = {
         "format": FORMAT,
+        "challenge": config.challenge.name,
         "policy": policy_fingerprint,
         "data": data.fingerprint,
         "split": data.split,
@@ -114,7 +117,8 @@ def make_plan(
         "round": round_m,
         "numbers": NUMBERS_VERSION,
     }
-    return Plan(shards, tuple(int(agents[shard.start : shard.stop].sum()) for shard in shards), identity)
+    num_agents = tuple(int(agents[shard.start : shard.stop].sum()) for shard in shards)
+    return Plan(shards, num_agents, identity, config.challenge)
 
 
 def check_sources(data: ScenarioDataset) -> None:

@@ -16,13 +16,20 @@ from rich.table import Table
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import SCHEMA, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.rollout_files import AXES
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest
 from rlftsim.evaluation.score_files import format_scores, has_road_edge
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.policies.checkpoint import read_card
-from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
+from rlftsim.realism import (
+    METRIC_2025,
+    METRIC_2025_SCENARIO_GEN,
+    SIM_AGENTS,
+    MetricConfig,
+    SimulatedStates,
+    metric_by_name,
+    score,
+)
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.check import ArchiveCheck
@@ -31,6 +38,8 @@ from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
 BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}
 """RMM on the test split with the weights of 2025, no traffic light term; from the table of RLFTSim (CVPR 2026)."""
+BOARD_METRICS = {metric.challenge.name: metric for metric in (METRIC_2025, METRIC_2025_SCENARIO_GEN)}
+"""Metric of each challenge's leaderboard, by the challenge's name."""
 SERVER_ERRORS = """If the server answers with an error and no reason, or not for days, nothing in the file has to be
 wrong: entries wait up to several days, and others have met unexplained errors. Open an issue at
 waymo-research/waymo-open-dataset with the submission key that the page shows, the size and the SHA-256 above, and this
@@ -49,6 +58,7 @@ class Estimate:
     """95 %."""
     rmm_light_one: float
     """With the traffic light term set to 1, as in tables of models without one."""
+    metric: str
 
 
 def estimate_realism(path: str | PathLike[str], policy_fingerprint: str, config: EvaluateConfig) -> Estimate | str:
@@ -72,7 +82,7 @@ def estimate_realism(path: str | PathLike[str], policy_fingerprint: str, config:
         return f"{path} was evaluated with another {', '.join(differing)}."
     rmm = evaluation.mean_and_error("meta_metric")
     rmm_without_light = evaluation.mean_and_error("meta_metric_light_one").mean
-    return Estimate(str(path), rmm.count, rmm.mean, rmm.interval, rmm_without_light)
+    return Estimate(str(path), rmm.count, rmm.mean, rmm.interval, rmm_without_light, config.metric)
 
 
 @dataclass(frozen=True)
@@ -195,6 +205,10 @@ def _estimate_lines(estimate: Estimate | str) -> list[str]:
         f"RMM {estimate.rmm:.4f}, 95 % interval {low:.4f} to {high:.4f} (sampling of scenarios), over "
         f"{estimate.scenarios} scenarios of `{estimate.evaluation}`; with the traffic light term set to 1 "
         f"{estimate.rmm_light_one:.4f}. Validation and test split differ.",
+    ]
+    if metric_by_name(estimate.metric).challenge != SIM_AGENTS:
+        return lines
+    lines += [
         "",
         "| published, test split | RMM | this entry, light = 1, minus it |",
         "|---|---|---|",
@@ -213,17 +227,18 @@ class ArchiveScores:
 
     Args:
         data: Scenarios of the archive's split.
+        metric: Metric of the challenge that the archive is for.
 
     Raises:
         DataError: Scenarios without a logged future.
     """
 
-    def __init__(self, data: ScenarioDataset) -> None:
+    def __init__(self, data: ScenarioDataset, metric: MetricConfig = METRIC_2025) -> None:
         try:
             choose_scenarios(data, EvaluateConfig(split=data.split))
         except DataError as error:
             raise DataError(f"--score is for the validation split: {error}") from None
-        self._data, self._metric = data, metric_by_name("2025")
+        self._data, self._metric = data, metric
         self._rows: list[dict[str, object]] = []
         self._skipped: list[Skipped] = []
 
@@ -238,9 +253,13 @@ class ArchiveScores:
             self._skipped.append(Skipped(scenario.scenario_id, "has no road edge"))
             return
         assert decoded.values is not None
-        x, y, z, heading = (torch.from_numpy(decoded.values[:, :, axis].copy()) for axis in range(len(AXES)))
-        states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), x, y, z, heading)
-        result = score(scenario_log(scenario), states, self._metric)
+        x, y, z, heading, *sizes = torch.from_numpy(decoded.values).unbind(2)
+        size = None
+        if sizes:
+            width, length, height = sizes
+            size = torch.stack([length, width, height], -1)
+        states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), x, y, z, heading, size=size)
+        result = score(scenario, states, self._metric)
         self._rows.append(row_of_result(result, scenario, states))
 
     def table(self, check: ArchiveCheck, sample: float) -> Table:

@@ -39,15 +39,16 @@ CONSTRAINED_MEANS = ("speed", "evaluated_speed", "min_ade", "kinematic")
 
 
 def check_metric(name: str) -> None:
-    """Check that there is a meta-metric of a name.
+    """Check that there is a meta-metric of a name, and that rollouts of the closed loop have one.
 
     Raises:
-        ConfigError: There is none; the message lists the known names.
+        ConfigError: There is none, with the known names, or a metric of whole scenes.
     """
     if name != "2025":
-        from rlftsim.realism import metric_by_name  # not at the top: it imports torch
+        from rlftsim.realism import SIM_AGENTS, metric_by_name  # not at the top: it imports torch
 
-        metric_by_name(name)
+        if metric_by_name(name).challenge != SIM_AGENTS:
+            raise ConfigError(f"metric {name} scores generated scenes, and training goes on from logs: take 2025.")
 
 
 def complete_reward(text: str) -> tuple[str, bool]:

@@ -167,6 +167,11 @@ VERBS = {
         "ask agents for things in the browser, and look at what happens",
         Command("studio:studio"), starts_anew=True,
     ),
+    "serve": Verb(
+        "serve traffic to other simulators",
+        {"alpasim": Command("serve:serve_alpasim")},
+        "Serve traffic to other simulators.", starts_anew=True,
+    ),
     "score": Verb(
         "score rollouts of any simulator with the official realism meta-metric",
         Command("score:score", ("rollouts",), show="print_scores", has_shares=True),
@@ -186,13 +191,13 @@ VERBS = {
         Command("report:report", ("results",), names={"runs": "run"}, show="print_report"),
     ),
     "submit": Verb(
-        "build an archive for the Sim Agents leaderboard, or check one before it is uploaded",
+        "build an archive for the Sim Agents or scenario generation leaderboard, or check one",
         {
             "build": Command("submit:build", ("model",), has_shares=True),
             "check": Command("submit:check", ("archive",)),
             "info": Command("submit:info", ("archive",)),
         },
-        "Build, check or describe an archive for the Sim Agents challenge (docs/submission.md).",
+        "Build, check or describe an archive for a challenge of the Waymo Open Dataset (docs/submission.md).",
     ),
     "experiment": Verb(
         "repeat an experiment of the paper: a table, verdicts and a figure; or sit the exam",

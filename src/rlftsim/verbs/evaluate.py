@@ -56,7 +56,8 @@ def evaluate(
         num_rollouts: Rollouts per scenario; the official metric is defined for 32.
         seed: Seed of all randomness. The same seed gives the same scores.
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
-        metric: Year of the meta-metric.
+        metric: Year of the meta-metric, or "2025-scenario-gen" for the challenge in which whole scenes are made: agents
+            but the ego begin at states drawn from the lanes, see docs/scenario_generation.md.
         sampling: Temperature and truncation of the decisions; left out, the whole distribution is sampled.
         goals: Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model.
         jobs: Processes, each with one thread, on CPUs only. Changes no result.

@@ -17,8 +17,9 @@ def export(exporter: str, rollouts: Path, out: Path, *, scenarios: Name) -> None
     """Write stored rollouts as files that other programs read.
 
     Args:
-        exporter: "gpudrive" writes a JSON file for each rollout, which GPUDrive and PufferDrive read, "page" a page
-            that plays in any browser, "film" an mp4; other names are those of installed plug-ins.
+        exporter: "gpudrive" writes a JSON file for each rollout, which GPUDrive and PufferDrive read, "rerun" one
+            for the Rerun viewer, "page" a page that plays in any browser, "film" an mp4; other names are those of
+            installed plug-ins.
         rollouts: File of rollouts, or folder of them, as of `rlftsim simulate`.
         out: Folder for the files; those of the same names are replaced.
         scenarios: Simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic".

@@ -12,8 +12,9 @@ import numpy as np
 from rich.table import Column, Table
 
 from rlftsim.errors import DataError
-from rlftsim.evaluation.evaluate import EvaluateConfig, simulate_evaluated
+from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioRows
+from rlftsim.evaluation.rollout_states import simulate_evaluated
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy

@@ -91,7 +91,8 @@ def simulate(
             than it learned to.
         picture: Draw OUT/SCENARIO.png: simulated paths of the agents with goals, or else of the evaluated agents.
         export: Write further files of each scenario: "page" is OUT/SCENARIO.html, which plays in any browser, "film" is
-            OUT/SCENARIO.mp4, "gpudrive" a JSON file for each rollout; other names are those of installed plug-ins.
+            OUT/SCENARIO.mp4, "gpudrive" a JSON file for each rollout, "rerun" one for the Rerun viewer; other names
+            are those of installed plug-ins.
         device: Device of a model that is loaded; auto: the GPU if torch has one; several processes (--jobs) need cpu.
         jobs: Processes, each with one thread. Changes no result.
         work: Machines that share the work.

@@ -1,7 +1,8 @@
-"""`rlftsim submit`: build, check or describe an archive for the Sim Agents challenge."""
+"""`rlftsim submit`: build, check or describe an archive for the Sim Agents or Scenario Generation challenge."""
 
 import time
 from pathlib import Path
+from typing import Literal
 
 from rlftsim.errors import ConfigError, shorten
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
@@ -16,6 +17,7 @@ from rlftsim.submission.check import ArchiveCheck, check_archive
 from rlftsim.submission.entry import count_parameters, read_entry, statement
 from rlftsim.submission.plan import prepare_job
 from rlftsim.submission.report import (
+    BOARD_METRICS,
     ArchiveScores,
     Report,
     estimate_realism,
@@ -26,6 +28,7 @@ from rlftsim.submission.report import (
 )
 from rlftsim.verbs.arguments import Device
 
+ChallengeName = Literal["sim-agents", "scenario-gen"]
 CACHED_SCENARIOS = 2
 """Each is read once."""
 EVALUATIONS = Path("runs/evaluations")
@@ -37,6 +40,7 @@ def build(
     out: Path,
     config: Path,
     *,
+    challenge: ChallengeName = "sim-agents",
     split: str = "testing",
     account: str | None = None,
     method: str | None = None,
@@ -64,6 +68,8 @@ def build(
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
         out: Folder of the archive.
         config: TOML file with account, method, authors, affiliation, description and link (docs/submission.md).
+        challenge: Challenge of the entry. Scenario generation makes whole scenes: agents but the ego begin at states
+            drawn from the lanes.
         split: Split of the data set.
         account: E-mail address of the account that uploads, in place of the file's.
         method: Name on the leaderboard, in place of the file's.
@@ -91,19 +97,19 @@ def build(
     policy = load_policy(model, device)
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
     settings = EvaluateConfig(
-        seed=seed, temperature=temperature, top_k=top_k,
-        split=split, rollouts_per_pass=rollouts_per_pass, jobs=jobs,
+        metric=BOARD_METRICS[challenge].name, seed=seed, temperature=temperature, top_k=top_k, split=split,
+        rollouts_per_pass=rollouts_per_pass, jobs=jobs,
     )  # fmt: skip
     job = prepare_job(
         entry, policy, dataset, settings, out, num_shards=num_shards, round_m=round, is_partial=partial
     )  # fmt: skip
-    closed_loop = statement(policy, settings.sampling)
+    closed_loop = statement(policy, settings.sampling, settings.challenge)
     print_lines(closed_loop)
     if not i_comply:
         raise ConfigError("an entry has to declare this: add --i-comply if it is true of yours.")
     archive = build_archive(job, runner=work.runner(jobs, work.on_error), is_deleting=delete_parts)
     # the file that will be uploaded is checked, not what was meant to be in it
-    result = check_archive(archive, dataset)
+    result = check_archive(archive, dataset, challenge=settings.challenge)
     evaluation = evaluation or EVALUATIONS / f"{evaluation_name(model)}.parquet"
     findings, counts = select_findings(result)
     report = Report(
@@ -127,6 +133,7 @@ def check(
     archive: Path,
     data: str,
     *,
+    challenge: ChallengeName = "sim-agents",
     split: str = "testing",
     sample: float = 1.0,
     json: Path | None = None,
@@ -139,6 +146,7 @@ def check(
     Args:
         archive: Archive (.tar.gz) to check, of this or another writer.
         data: Folder of a data set, or "synthetic".
+        challenge: Challenge that the archive is for.
         split: Split that the archive is for.
         sample: Fraction of the scenarios whose trajectories are looked at, for a quick look.
         json: File for the findings as JSON.
@@ -150,8 +158,16 @@ def check(
     if json is not None:
         check_file(json)
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
-    scores = ArchiveScores(dataset) if score else None
-    result = check_archive(archive, dataset, sample=sample, expected_sha256=reported_sha256(archive), callback=scores)
+    metric = BOARD_METRICS[challenge]
+    scores = ArchiveScores(dataset, metric) if score else None
+    result = check_archive(
+        archive,
+        dataset,
+        sample=sample,
+        expected_sha256=reported_sha256(archive),
+        challenge=metric.challenge,
+        callback=scores,
+    )
     _print_findings(result)
     if json is not None:
         write_findings(result, json)
