@@ -48,6 +48,8 @@ class SumoScene:
     """Agent of each track of the window."""
     lights: Int64[np.ndarray, "T"]
     """Index in SUMO's answers of each light of the scene."""
+    ahead_m: float | None = 0.0
+    """Distance by which SUMO's ego is ahead of the planner's; None = SUMO drives an ego of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +126,9 @@ def advance_sumo(
         ego: Motion of the ego after the step, which the result leaves out; None = SUMO drives it.
     """
     pose, origin = None, scene.scenario.origin
-    if ego is not None:
-        front = ego[:2] + scene.size[scene.ego, 0] / 2 * np.array([np.cos(ego[2]), np.sin(ego[2])]) + origin
+    if ego is not None and sumo_scene.ahead_m is not None:
+        ahead_m = scene.size[scene.ego, 0] / 2 + sumo_scene.ahead_m
+        front = ego[:2] + ahead_m * np.array([np.cos(ego[2]), np.sin(ego[2])]) + origin
         pose = (float(front[0]), float(front[1]), 90.0 - float(np.degrees(ego[2])))
     poses = (*state.poses, pose)
     answer = _find_world(sumo_scene.window.path).step(sumo_scene.window.index, poses)
