@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.envs.contact import LaneSearch, lane_search
-from rlftsim.envs.route import find_route, sample_line
+from rlftsim.envs.route import compute_headings, find_route, sample_line
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.envs.sumo_traffic import build_sumo_scene
 from rlftsim.geometry import wrapped
@@ -34,9 +34,9 @@ MOVING_MPS = 0.5
 def find_conflicts(scenario: Scenario, data: Path) -> frozenset[str]:
     """Conflicts of the ego with road users that SUMO drives, among `CONFLICTS`.
 
-    Following: a vehicle less than 2 s behind the ego in its lane. Merging and crossing: a vehicle whose lane joins or
-    crosses the ego's route, where both are within 4 s at their present speeds, or within 20 m. Pedestrian: one who walks
-    to the ego's route within 4 s.
+    Following: a vehicle less than 2 s behind the ego in the same lane. Merging and crossing: a vehicle whose lane joins
+    or crosses the ego's route, where both are within 4 s at present speeds, or within 20 m. Pedestrian: a walker who is
+    on the ego's route within 4 s.
 
     Args:
         scenario: Scenario of the data set; of the log after the current step only the ego's route counts.
@@ -74,8 +74,7 @@ def find_conflicts(scenario: Scenario, data: Path) -> frozenset[str]:
             if not meets[first] or first == 0:  # never, or ahead on the ego's route
                 continue
             place = int(distance[first].argmin())
-            direction = line[min(first + 1, len(line) - 1)] - line[min(first + 1, len(line) - 1) - 1]
-            turn = abs(float(wrapped(np.arctan2(direction[1], direction[0]) - heading[place])))
+            turn = abs(float(wrapped(compute_headings(line)[[first]] - heading[place])[0]))
             if way_m[place] <= SAME_PLACE_M and turn < ALONG_RAD:
                 gap_m = first - (scene.size[agent, 0] + scene.size[scene.ego, 0]) / 2
                 conflicts |= {FOLLOWING} if gap_m < HEADWAY_S * speed[agent] else set()

@@ -1,8 +1,7 @@
 """Agreement of simulated traffic with the world that made the logs: errors, rankings and failures of planners.
 
-Shapes: T types of traffic, of which the first is the truth; P planners, W windows, D draws of the bootstrap. Every
-statistic is computed for D sets of weights of the windows at once: the first set has equal weights, the others are draws
-of whole networks.
+Shapes: T types of traffic, of which the first is the truth; P planners, W windows, D sets of weights of the windows,
+for which every statistic is computed at once: the first set has equal weights, the others are draws of whole networks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -179,9 +178,7 @@ def measure_agreement(
     }
 
 
-def count_failures(
-    is_failure: Bool[np.ndarray, "T P W"], mask: Bool[np.ndarray, "P W"]
-) -> list[tuple[int, int, int]]:
+def count_failures(is_failure: Bool[np.ndarray, "T P W"], mask: Bool[np.ndarray, "P W"]) -> list[tuple[int, int, int]]:
     """Episodes that fail in both, in the truth alone, and in the traffic alone, for each type of traffic.
 
     Args:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -80,8 +81,8 @@ def build_error_table(windows: WindowSet) -> TextTable:
     ]  # fmt: skip
     note = (
         f"{len(episodes.windows)} windows of {len({*episodes.networks})} networks × {len(episodes.planners)} planners, "
-        "one rollout. Errors against the truth; 95 % intervals by bootstrap over networks. Failures: at fault in both · "
-        "missed · false."
+        "one rollout. Errors against the truth; 95 % intervals by bootstrap over networks. Failures: at fault in both "
+        "· missed · false."
     )
     return TextTable(f"Errors, {windows.name}", ("", *columns, "failures"), tuple(rows), note)
 
@@ -127,7 +128,7 @@ def list_distances(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"
     distance = episodes.values["distance_m"][0]
     return [
         (f"{low:g}–{high:g} m" if np.isfinite(high) else f"> {low:g} m", (distance >= low) & (distance < high))
-        for low, high in zip(DISTANCES_M, DISTANCES_M[1:])
+        for low, high in pairwise(DISTANCES_M)
     ]
 
 
@@ -200,11 +201,11 @@ def draw_figure(sets: Sequence[WindowSet], shown: Sequence[str]) -> Figure:
             low, high = np.nanquantile(means[1:], (0.025, 0.975), axis=0)
             for color, name in zip(COLORS, shown):
                 t = episodes.traffic.index(name)
-                x, y = means[0, 0], means[0, t]
-                spans = [np.abs(np.stack([m - lo, hi - m])) for m, lo, hi in ((x, low[0], high[0]), (y, low[t], high[t]))]
+                spans = np.abs(np.stack([means[0] - low, high - means[0]]))  # [2, T, P]
                 axis.errorbar(
-                    x, y, xerr=spans[0], yerr=spans[1], fmt="o", color=color, ms=4.5, lw=0.6, alpha=0.8, label=name
-                )
+                    means[0, 0], means[0, t], xerr=spans[:, 0], yerr=spans[:, t], fmt="o", color=color, ms=4.5, lw=0.6,
+                    alpha=0.8, label=name,
+                )  # fmt: skip
             highest = max(axis.get_xlim()[1], axis.get_ylim()[1])
             axis.plot([0, highest], [0, highest], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=0)
             for p, name in enumerate(episodes.planners):

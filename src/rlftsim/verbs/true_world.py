@@ -24,8 +24,8 @@ def true_world(
 
     Every window is driven in the world itself (SUMO), in the same world without reaction (ghost), in replay, constant
     velocity, IDM and each model. Writes OUT/rows.parquet, a row per episode, OUT/report.md and OUT/figure.png, with
-    intervals over street networks. Interrupted, the same command goes on where it was; with a smaller --limit it reports
-    on what has been driven. Needs the extras env and synthetic.
+    intervals over street networks. Interrupted, the same command goes on where it was; with a smaller --limit it
+    reports on what has been driven. Needs the extras env and synthetic.
 
     Args:
         data: Folder of a data set made by `rlftsim synthesize --keep-worlds`, unseen by the models.
