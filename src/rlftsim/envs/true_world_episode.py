@@ -22,7 +22,6 @@ from rlftsim.envs.source import Source
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import load_policy
-from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 
@@ -133,9 +132,8 @@ def read_row(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
 class _WorldSource(Source):
     """A scenario with SUMO's ego ahead of the planner's, or with an ego of SUMO's own."""
 
-    def __init__(self, config: EnvConfig, scenario: Scenario, policy: Policy | None, ahead_m: float | None):
-        super().__init__(config, [scenario], policy)
-        self.ahead_m = ahead_m
+    ahead_m: float | None = 0.0
+    """See `Surroundings`."""
 
     def episode(self, scenarios: list[Scenario], goals: ScenarioGoals | None = None) -> Episode:
         """An episode, see `Source`."""
@@ -152,17 +150,13 @@ def _make_environment(data: str, window: str, surroundings: Surroundings, settin
         temperature=surroundings.temperature, **dict(settings),
     )  # fmt: skip
     policy = load_model(surroundings.model) if surroundings.traffic in ("policy", "idm") else None
-    return EgoEnv(source=_WorldSource(config, _load_scenario(data, window), policy, surroundings.ahead_m))
+    source = _WorldSource(config, [_load_scenario(data, window)], policy)
+    source.ahead_m = surroundings.ahead_m
+    return EgoEnv(source=source)
 
 
-@lru_cache(maxsize=8)
-def load_model(name: str) -> Policy:
-    """Traffic model, loaded once in each process.
-
-    Args:
-        name: Name that `load_policy` takes.
-    """
-    return load_policy(name)
+load_model = lru_cache(maxsize=8)(load_policy)
+"""Traffic model of a name, loaded once in each process."""
 
 
 @lru_cache(maxsize=2)
