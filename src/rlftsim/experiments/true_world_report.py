@@ -221,8 +221,8 @@ def draw_figure(sets: Sequence[WindowSet], shown: Sequence[str]) -> Figure:
     return figure
 
 
-def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> tuple[list[TextTable], list[str]]:
-    """Write report.md and figure.png; returns the tables and the verdicts.
+def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> list[str]:
+    """Write report.md and figure.png; returns the verdicts.
 
     Args:
         episodes: Episodes of all windows.
@@ -268,4 +268,4 @@ def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> tuple[
         f"Made with {format_origin(environment)}, on {environment['machine']}.",
     ]  # fmt: skip
     write_text(out / "report.md", "\n\n".join(parts) + "\n")
-    return tables, lines
+    return lines

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from rlftsim.jobs.progress import print_line, print_wide
+from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work, choose_runner
 
 ALL = "all"
@@ -53,8 +53,6 @@ def true_world(
     count = len(config.list_trips())
     table = drive_true_world(config, out, work.runner(jobs, work.on_error) or choose_runner(jobs, count))
     episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
-    tables, lines = write_report(episodes, [s.name for s in learned], out)
-    print_wide(*(table.for_terminal() for table in tables[:2]))
-    for line in lines:
+    for line in write_report(episodes, [s.name for s in learned], out):
         print_line(f"* {line}")
     print_line(out / "report.md")
