@@ -45,7 +45,7 @@ class Episodes:
     @cached_property
     def is_measured(self) -> Bool[np.ndarray, "P W"]:
         """True where the planner has driven in all traffic."""
-        return np.isfinite(self.values["nuplan_style"]).all(0)
+        return np.asarray(np.isfinite(self.values["nuplan_style"]).all(0))
 
     def select(self, is_chosen: Bool[np.ndarray, "W"]) -> "Episodes":
         """Episodes of some windows."""
