@@ -82,7 +82,7 @@ def help_of(*words: str) -> str:
 def cli_page(verb: str) -> str:
     """Usage and flags of a verb and of its actions."""
     text = help_of(verb)
-    actions = ACTIONS.search(text) or ("", "exam" if verb == "experiment" else "")
+    actions = ACTIONS.search(text) or ("", "exam,true-world" if verb == "experiment" else "")
     parts = [f"# rlftsim {verb}\n", described(text)]
     for action in filter(None, actions[1].split(",")):
         parts += [f"## rlftsim {verb} {action}\n", described(help_of(verb, action))]

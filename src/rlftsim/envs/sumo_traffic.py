@@ -39,6 +39,10 @@ Poses = tuple[SumoPose | None, ...]
 """SUMO's pose of the ego at each step after the current one; None = SUMO drives it."""
 
 
+class SumoFailure(RlftsimError):
+    """SUMO has failed in an episode twice: for lack of memory, or by a fault of its own."""
+
+
 @dataclass(frozen=True, eq=False)
 class SumoScene:
     """A scene whose other agents SUMO drives."""
@@ -48,6 +52,8 @@ class SumoScene:
     """Agent of each track of the window."""
     lights: Int64[np.ndarray, "T"]
     """Index in SUMO's answers of each light of the scene."""
+    ahead_m: float | None = 0.0
+    """Distance by which SUMO's ego is ahead of the planner's; None = SUMO drives an ego of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +130,9 @@ def advance_sumo(
         ego: Motion of the ego after the step, which the result leaves out; None = SUMO drives it.
     """
     pose, origin = None, scene.scenario.origin
-    if ego is not None:
-        front = ego[:2] + scene.size[scene.ego, 0] / 2 * np.array([np.cos(ego[2]), np.sin(ego[2])]) + origin
+    if ego is not None and sumo_scene.ahead_m is not None:
+        ahead_m = scene.size[scene.ego, 0] / 2 + sumo_scene.ahead_m
+        front = ego[:2] + ahead_m * np.array([np.cos(ego[2]), np.sin(ego[2])]) + origin
         pose = (float(front[0]), float(front[1]), 90.0 - float(np.degrees(ego[2])))
     poses = (*state.poses, pose)
     answer = _find_world(sumo_scene.window.path).step(sumo_scene.window.index, poses)
@@ -179,7 +186,7 @@ class SumoWorld:
             poses: All poses of the ego since the current step, at least one.
 
         Raises:
-            RlftsimError: The process has failed twice.
+            SumoFailure: The process has failed twice.
         """
         reason = ""
         for _ in range(2):  # a process that was killed, perhaps for memory: all its states can be made again
@@ -187,7 +194,7 @@ class SumoWorld:
                 return self._step(window, poses)
             except (OSError, EOFError):
                 reason = self.close()
-        raise RlftsimError(f"SUMO has failed twice in {self.path} ({reason}): free memory, or {REMEDY}.")
+        raise SumoFailure(f"SUMO has failed twice in {self.path} ({reason}): free memory, or {REMEDY}.")
 
     def _step(self, window: int, poses: Poses) -> dict[str, Any]:
         channel, new_poses = self.channels.pop((window, poses[:-1]), None), poses[-1:]

@@ -204,6 +204,7 @@ VERBS = {
         {
             "": Command("experiment:experiment", ("name",), sections=("tokens", "model", "pretrain", *FINETUNING)),
             "exam": Command("exam:exam"),
+            "true-world": Command("true_world:true_world", has_shares=True),
         },
     ),
 }  # fmt: skip

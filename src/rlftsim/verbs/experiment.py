@@ -20,6 +20,9 @@ from rlftsim.verbs.inputs import to_recipe
 
 QUESTIONS = "Experiment. " + "; ".join(f"{name}: {experiment_by_name(name).question}" for name in PAPER)
 QUESTIONS += "; exam: Are models better where no choice was made? (see `rlftsim experiment exam --help`)"
+QUESTIONS += (
+    "; true-world: Are planners judged rightly in simulated traffic? (see `rlftsim experiment true-world --help`)"
+)
 
 
 def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str]) -> None:

@@ -1,0 +1,122 @@
+"""Planners in the world that made a log, and in other traffic: a row for each window, planner and type of traffic.
+
+Windows come in turn from all networks, and each is driven in everything before the next one begins, so a run that is
+stopped has measured the same of every planner.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import rlftsim
+from rlftsim.envs.planners.registry import hash_code
+from rlftsim.envs.true_world_episode import PLANNERS, Surroundings, Trip, load_model, read_row
+from rlftsim.errors import ConfigError, whole_number
+from rlftsim.evaluation.resumable import ScenarioValues, run_groups
+from rlftsim.evaluation.scenario_source import hash_manifest
+from rlftsim.jobs.files import write_atomically
+from rlftsim.jobs.folder import Lease, check_folder
+from rlftsim.jobs.runner import Runner
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
+from rlftsim.scenario.synthetic.worlds import find_window
+
+ROWS = "rows.parquet"
+TRUTH = Surroundings("truth", "sumo")
+GHOST = Surroundings("ghost", "sumo", ahead_m=None)
+"""What truth does with its own ego: nobody reacts to the planner."""
+RULES = (
+    Surroundings("replay", "replay"), Surroundings("constant velocity", "constant_velocity"),
+    Surroundings("idm", "idm"),
+)  # fmt: skip
+
+
+def shift_truth(ahead_m: float) -> Surroundings:
+    """Truth in which the others see the ego ahead of its place, as label noise moves it: no error is smaller.
+
+    Args:
+        ahead_m: Distance along the ego's heading, m.
+    """
+    return Surroundings(f"truth {ahead_m:g} m ahead", "sumo", ahead_m=ahead_m)
+
+
+@dataclass(frozen=True)
+class TrueWorldConfig:
+    """Windows, planners and types of traffic."""
+
+    data: str
+    """Data set with worlds, all splits."""
+    surroundings: tuple[Surroundings, ...]
+    planners: tuple[str, ...] = tuple(PLANNERS)
+    """Names of `PLANNERS`, or any that `load_planner` takes."""
+    seed: int = 0
+    limit: int | None = None
+    """Only the first so many windows."""
+
+    def __post_init__(self) -> None:
+        if self.limit is not None:
+            whole_number("limit", self.limit, 1)
+        for label, names in (("planners", self.planners), ("models", [s.name for s in self.surroundings])):
+            if len({*names}) < len(names):
+                raise ConfigError(f"{label}: two of {', '.join(names)} have the same name: leave one out.")
+
+    def list_trips(self) -> list[Trip]:
+        """All episodes, window by window, a window of each network in turn.
+
+        Raises:
+            DataError: A scenario without a world.
+        """
+        folder = dataset_folder(self.data)
+        windows = {name: find_window(folder, name) for name in ScenarioDataset(folder).scenario_ids}
+        by_network: dict[str, list[str]] = {}
+        for name, window in sorted(windows.items(), key=lambda item: (item[1].path, item[1].index)):
+            by_network.setdefault(window.path.stem, []).append(name)
+        turns = sorted((turn, network) for network, names in by_network.items() for turn in range(len(names)))
+        return [
+            Trip(self.data, by_network[network][turn], network, surroundings, planner, self.seed)
+            for turn, network in turns[: self.limit] for surroundings in self.surroundings for planner in self.planners
+        ]  # fmt: skip
+
+
+def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.Table:
+    """Rows of all episodes, written to OUT/rows.parquet; only what earlier calls left undone is driven.
+
+    Args:
+        config: Windows, planners and types of traffic.
+        out: Folder of the rows, and of a file for each episode.
+        runner: Runner of the episodes; changes nothing but `seconds`.
+
+    Raises:
+        ConfigError: An unknown planner or model, or SUMO cannot run here.
+        DataError: A data set without worlds.
+        SetAside, Unfinished: See `run_items`.
+    """
+    check_folder(out, "results")
+    trips = config.list_trips()
+    codes = {trip.planner: hash_code(trip.planner_name) for trip in trips[: len(config.planners)]}
+    models = {s.name: fingerprint_policy(load_model(s.model)) for s in config.surroundings if s.traffic == "policy"}
+    manifest = hash_manifest(dataset_folder(config.data))
+    identity = {
+        trip.name: {
+            "manifest": manifest, "seed": trip.seed, "surroundings": asdict(trip.surroundings),
+            "planner_code": codes[trip.planner], "model": models.get(trip.surroundings.name, "none"),
+            "rlftsim_version": rlftsim.__version__,
+        }
+        for trip in trips
+    }  # fmt: skip
+    names = [trip.name for trip in trips]
+    format = ScenarioValues(out / "episodes", names, identity, read_row)
+    with Lease(format.folder / ".lock", runner, "works in") as lease:
+        rows = run_groups("episodes", names, partial(_drive_trip, trips), format, lease, runner)
+        lease.remove()
+    table = pa.Table.from_pylist(rows)
+    write_atomically(out / ROWS, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+    return table
+
+
+def _drive_trip(trips: Sequence[Trip], position: int) -> dict[str, object]:
+    return trips[position].drive()

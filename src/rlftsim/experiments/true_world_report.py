@@ -1,0 +1,271 @@
+"""Tables, verdicts and the picture of planners in simulated traffic against the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+
+from rlftsim.experiments.results import format_origin
+from rlftsim.experiments.tables import TextTable
+from rlftsim.experiments.true_world import (
+    VEHICLE_CONFLICTS,
+    Episodes,
+    average,
+    count_failures,
+    find_interval,
+    measure_agreement,
+    pool,
+)
+from rlftsim.jobs.files import write_text
+from rlftsim.training.run_folder import describe_environment
+from rlftsim.viewer.figure import COLORS, INK, save_figure
+
+SCORE, HIT, AT_FAULT = "nuplan_style", "hit_rate", "at_fault_collision_rate"
+DISTANCES_M = (0.0, 1.0, 5.0, 15.0, np.inf)
+REFERENCES = ("replay", "idm")
+GHOST = "ghost"
+AIMS = {"tau_b": 0.9, "at_fault": 0.03, "random": 0.02}
+MAX_COLORS = len(COLORS)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSet:
+    """Windows with a name, in which all statistics are computed."""
+
+    name: str
+    episodes: Episodes
+
+    def measure(
+        self, column: str, statistic: str, mask: Bool[np.ndarray, "P W"] | None = None
+    ) -> Float[np.ndarray, "D T"]:
+        """Statistic of a score for each draw and type of traffic, see `measure_agreement`."""
+        mask = self.episodes.is_measured if mask is None else self.episodes.is_measured & mask
+        return measure_agreement(self.episodes.values[column], mask, self.episodes.weights)[statistic]
+
+
+def choose_sets(episodes: Episodes) -> list[WindowSet]:
+    """All windows, and those with a conflict of vehicles."""
+    has_conflict = np.array([bool(conflicts & {*VEHICLE_CONFLICTS}) for conflicts in episodes.conflicts])
+    sets = [WindowSet("random windows", episodes)]
+    return [*sets, WindowSet("conflict windows", episodes.select(has_conflict))] if has_conflict.any() else sets
+
+
+def format_cell(draws: Float[np.ndarray, "D"], digits: int = 3, sign: str = "") -> str:
+    """Estimate with its interval, such as 0.020 [0.011, 0.031]; a dash for NaN."""
+    mean, low, high = find_interval(draws)
+    return f"{mean:{sign}.{digits}f} [{low:{sign}.{digits}f}, {high:{sign}.{digits}f}]" if np.isfinite(mean) else "–"
+
+
+def build_error_table(windows: WindowSet) -> TextTable:
+    """Errors of the score, the hit rate and the rate of collisions at fault, in each traffic."""
+    episodes = windows.episodes
+    columns = {
+        "score of a planner": (SCORE, "planner_error"), "score of an episode": (SCORE, "episode_error"),
+        "bias": (SCORE, "bias"), "off by > 0.05": (SCORE, "changed"), "τ_b": (SCORE, "tau_b"),
+        "R²": (SCORE, "r_squared"), "hit rate of a planner": (HIT, "planner_error"),
+        "of an episode": (HIT, "episode_error"), "at fault": (AT_FAULT, "planner_error"),
+        "PDMS of a planner": ("pdms_style", "planner_error"),
+    }  # fmt: skip
+    tables = [windows.measure(column, statistic) for column, statistic in columns.values()]
+    failures = count_failures(episodes.values[AT_FAULT] > 0, episodes.is_measured)
+    rows = [
+        (
+            name, *(format_cell(table[:, t], sign="+" if label == "bias" else "")
+            for label, table in zip(columns, tables)), " · ".join(map(str, failures[t])),
+        )
+        for t, name in enumerate(episodes.traffic) if t
+    ]  # fmt: skip
+    note = (
+        f"{len(episodes.windows)} windows of {len({*episodes.networks})} networks × {len(episodes.planners)} planners, "
+        "one rollout. Errors against the truth; 95 % intervals by bootstrap over networks, "
+        "whose draws make absolute errors of means larger. Failures: at fault in both · missed · false."
+    )
+    return TextTable(f"Errors, {windows.name}", ("", *columns, "failures"), tuple(rows), note)
+
+
+def build_paired_table(windows: WindowSet) -> TextTable:
+    """Errors in each traffic minus those of replay and of IDM, by the same draws."""
+    traffic = windows.episodes.traffic
+    references = [name for name in REFERENCES if name in traffic]
+    measured = {
+        f"{label} − {name}": table - table[:, [traffic.index(name)]]
+        for label, table in (
+            ("score of an episode", windows.measure(SCORE, "episode_error")),
+            ("hit rate of an episode", windows.measure(HIT, "episode_error")),
+        )
+        for name in references
+    }
+    rows = [
+        (name, *(format_cell(table[:, t], sign="+") for table in measured.values()))
+        for t, name in enumerate(traffic)
+        if t
+    ]
+    note = "Below zero: smaller errors than those of the other traffic."
+    return TextTable(f"Paired differences of errors, {windows.name}", ("", *measured), tuple(rows), note)
+
+
+def build_parts_table(
+    windows: WindowSet, title: str, parts: Sequence[tuple[str, Bool[np.ndarray, "P W"]]]
+) -> TextTable:
+    """Errors of an episode's score and hit rate in parts of the episodes, a row for each traffic."""
+    episodes, rows = windows.episodes, []
+    masks = [mask & episodes.is_measured for _, mask in parts]
+    errors = [np.abs(episodes.values[column] - episodes.values[column][:1]) for column in (SCORE, HIT)]
+    tables = [pool(error, mask, episodes.weights) for mask in masks for error in errors]
+    for t, name in enumerate(episodes.traffic):
+        cells = [format_cell(table[:, t]) for table in tables]
+        rows += [(name, *(f"{score} · {hit}" for score, hit in zip(cells[::2], cells[1::2])))] if t else []
+    headings = [f"{label} ({int(mask.sum())} episodes)" for (label, _), mask in zip(parts, masks)]
+    return TextTable(title, ("", *headings), tuple(rows), "Error of the score · error of the hit rate of an episode.")
+
+
+def list_distances(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
+    """Episodes by the planner's distance from the log after 8 s in the truth."""
+    distance = episodes.values["distance_m"][0]
+    return [
+        (f"{low:g}–{high:g} m" if np.isfinite(high) else f"> {low:g} m", (distance >= low) & (distance < high))
+        for low, high in pairwise(DISTANCES_M)
+    ]
+
+
+def list_conflicts(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
+    """Episodes by the conflicts of their windows, which may have several."""
+    parts = [(name, {name}) for name in (*VEHICLE_CONFLICTS, "pedestrian")]
+    masks = [(name, np.array([bool(words & found) for found in episodes.conflicts])) for name, words in parts]
+    masks.append(("none", np.array([not found for found in episodes.conflicts])))
+    return [(name, np.broadcast_to(mask, (len(episodes.planners), len(mask)))) for name, mask in masks]
+
+
+def build_planner_table(windows: WindowSet, column: str) -> TextTable:
+    """Mean of a score by planner and traffic."""
+    episodes = windows.episodes
+    means = average(episodes.values[column], episodes.is_measured, episodes.weights)[0]
+    rows = [(name, *(f"{mean:.3f}" for mean in means[t])) for t, name in enumerate(episodes.traffic)]
+    return TextTable(f"{column}, {windows.name}", ("", *episodes.planners), tuple(rows))
+
+
+def list_verdicts(sets: Sequence[WindowSet], models: Sequence[str]) -> list[str]:
+    """Lines on what holds: whether reaction matters, and the aims for the best of the learned traffic.
+
+    Args:
+        sets: Random windows first, then conflict windows if there are any.
+        models: Names of the learned traffic.
+    """
+    lines = []
+    for windows in sets:
+        episodes = windows.episodes
+        if GHOST in episodes.traffic:
+            ghost = episodes.traffic.index(GHOST)
+            error = np.abs(episodes.values[SCORE][ghost] - episodes.values[SCORE][0])[episodes.is_measured]
+            hits = (episodes.values[HIT][ghost] != episodes.values[HIT][0])[episodes.is_measured]
+            lines.append(
+                f"{windows.name}: reaction moves the score by more than 0.05 in {int((error > 0.05).sum())} of "
+                f"{len(error)} episodes, and who is hit in {int(hits.sum())}."
+            )
+        for label, column in (("score", SCORE), ("hit rate", HIT)):
+            table = windows.measure(column, "planner_error")
+            learned = [t for t, name in enumerate(episodes.traffic) if name in models]
+            if not learned:
+                continue
+            best = min(learned, key=lambda t: table[0, t])
+            aims = [
+                f"{'≤' if table[0, best] <= table[0, episodes.traffic.index(name)] / 2 else 'not ≤'} half of {name}'s "
+                f"{table[0, episodes.traffic.index(name)]:.3f}"
+                for name in REFERENCES
+                if name in episodes.traffic
+            ]
+            lines.append(
+                f"{windows.name}, {label} of a planner: best learned traffic {episodes.traffic[best]} "
+                f"{format_cell(table[:, best])}, {', '.join(aims)}."
+            )
+    return lines
+
+
+def draw_figure(sets: Sequence[WindowSet], shown: Sequence[str]) -> Figure:
+    """Mean of each planner in the truth and in other traffic, a color for each traffic, with 95 % intervals.
+
+    Args:
+        sets: Windows, a row of panels for each.
+        shown: Names of the traffic to show, at most one for each color.
+    """
+    figure = Figure(figsize=(9.0, 4.3 * len(sets)), layout="constrained")
+    axes = figure.subplots(len(sets), 2, squeeze=False)
+    for row, windows in enumerate(sets):
+        episodes = windows.episodes
+        for axis, (column, label) in zip(axes[row], ((SCORE, "nuPlan-style score"), (HIT, "hit rate"))):
+            means = average(episodes.values[column], episodes.is_measured, episodes.weights)  # [D, T, P]
+            low, high = np.nanquantile(means[1:], (0.025, 0.975), axis=0)
+            for color, name in zip(COLORS, shown):
+                t = episodes.traffic.index(name)
+                spans = np.abs(np.stack([means[0] - low, high - means[0]]))  # [2, T, P]
+                axis.errorbar(
+                    means[0, 0], means[0, t], xerr=spans[:, 0], yerr=spans[:, t], fmt="o", color=color, ms=4.5, lw=0.6,
+                    alpha=0.8, label=name,
+                )  # fmt: skip
+            highest = max(axis.get_xlim()[1], axis.get_ylim()[1])
+            axis.plot([0, highest], [0, highest], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=0)
+            for p, name in enumerate(episodes.planners if column == SCORE else ()):  # rates lie too close
+                axis.annotate(
+                    name, (means[0, 0, p], 0.0), xycoords=("data", "axes fraction"), fontsize=6.5, rotation=90,
+                    ha="center", va="bottom", color="#79828f", xytext=(0, 3), textcoords="offset points",
+                )  # fmt: skip
+            axis.set_title(f"{label}, {len(episodes.windows)} {windows.name}", fontsize=10, loc="left", color=INK)
+            axis.set(xlabel="in the world itself (SUMO)", ylabel="in simulated traffic")
+            axis.spines[["top", "right"]].set_visible(False)
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9)
+    return figure
+
+
+def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> list[str]:
+    """Write report.md and figure.png; returns the verdicts.
+
+    Args:
+        episodes: Episodes of all windows.
+        models: Names of the learned traffic.
+        out: Folder of the files.
+    """
+    sets, values = choose_sets(episodes), episodes.values
+    is_seen = values["off_lane_steps"][0] == 0
+    seen = WindowSet("episodes whose ego SUMO always sees", episodes)
+    seen_tables = [seen.measure(SCORE, "episode_error", is_seen), seen.measure(HIT, "episode_error", is_seen)]
+    tables = [build_error_table(windows) for windows in sets] + [build_paired_table(windows) for windows in sets]
+    tables += [
+        build_parts_table(sets[0], "By distance from the log after 8 s", list_distances(episodes)),
+        build_parts_table(sets[0], "By conflict at the current step", list_conflicts(episodes)),
+        TextTable(
+            f"Without the {np.mean(~is_seen):.0%} of episodes with steps at which the ego is on no lane of SUMO",
+            ("", "score of an episode", "hit rate of an episode"),
+            tuple(
+                (name, *(format_cell(table[:, t]) for table in seen_tables))
+                for t, name in enumerate(episodes.traffic)
+                if t
+            ),
+        ),
+        *(build_planner_table(windows, column) for windows in sets for column in (SCORE, HIT, AT_FAULT)),
+        TextTable(
+            "CPU seconds of an episode in this process; SUMO's own come on top",
+            ("", "mean"),
+            tuple((name, f"{np.nanmean(values['seconds'][t]):.2f}") for t, name in enumerate(episodes.traffic)),
+        ),
+    ]
+    lines = list_verdicts(sets, models)
+    lines.append(
+        f"A road user that is no agent of the scenario came within 20 m of the ego in "
+        f"{np.mean(values['num_strangers'][0] > 0):.0%} of the episodes in truth."
+    )
+    shown = [name for name in (*REFERENCES, "constant velocity", *models) if name in episodes.traffic][:MAX_COLORS]
+    save_figure(out / "figure.png", draw_figure(sets, shown))
+    environment = describe_environment()
+    parts = [
+        "# Planners in simulated traffic and in the world itself", "\n".join(f"* {line}" for line in lines),
+        "![Scores of planners in the world itself and in simulated traffic](figure.png)",
+        *(paragraph for table in tables for paragraph in table.paragraphs),
+        f"Made with {format_origin(environment)}, on {environment['machine']}.",
+    ]  # fmt: skip
+    write_text(out / "report.md", "\n\n".join(parts) + "\n")
+    return lines

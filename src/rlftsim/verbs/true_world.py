@@ -1,0 +1,58 @@
+"""`rlftsim experiment true-world`: are planners judged rightly in simulated traffic?"""
+
+from pathlib import Path
+
+from rlftsim.jobs.progress import print_line
+from rlftsim.jobs.runner import Work, choose_runner
+
+ALL = "all"
+
+
+def true_world(
+    data: str,
+    *,
+    models: str = "demo-base,demo-tuned",
+    planners: str = ALL,
+    out: Path = Path("runs/true-world"),
+    shifts: tuple[float, ...] = (0.1,),
+    limit: int | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    work: Work = Work(),  # noqa: B008
+) -> None:
+    """Score planners in simulated traffic and in the world that made the logs, where all others react as they do.
+
+    Every window is driven in the world itself (SUMO), in the same world without reaction (ghost), in replay, constant
+    velocity, IDM and each model. Writes OUT/rows.parquet, a row per episode, OUT/report.md and OUT/figure.png, with
+    intervals over street networks. Interrupted, the same command goes on where it was; with a smaller --limit it
+    reports on what has been driven. Needs the extras env and synthetic.
+
+    Args:
+        data: Folder of a data set made by `rlftsim synthesize --keep-worlds`, unseen by the models.
+        models: Traffic models separated by commas: runs, model folders or registered names, also as NAME=MODEL, and
+            with a temperature as in demo-tuned@1.3.
+        planners: Names separated by commas: log, constant_velocity, idm, pdm, timid, rush, late_braker, hard_braker, or
+            package.module:Class; all stands for these eight.
+        out: Folder for the results.
+        shifts: Meters by which the world's drivers see the ego ahead of its place: the floor of every error.
+        limit: Number of windows, one of each network in turn; left out, all of them.
+        seed: Seed of the traffic.
+        jobs: Processes, each with one thread. Changes no result.
+        work: Machines that share the work.
+    """
+    # Imported late: the environments need packages of an extra, and help does not.
+    from rlftsim.envs.true_world import GHOST, RULES, TRUTH, TrueWorldConfig, drive_true_world, shift_truth
+    from rlftsim.envs.true_world_episode import PLANNERS, Surroundings
+    from rlftsim.experiments.true_world import arrange_episodes
+    from rlftsim.experiments.true_world_report import write_report
+
+    learned = list(map(Surroundings.parse, filter(None, models.split(","))))
+    chosen = tuple(PLANNERS) if planners == ALL else tuple(name.strip() for name in planners.split(","))
+    surroundings = (TRUTH, GHOST, *RULES, *map(shift_truth, shifts), *learned)
+    config = TrueWorldConfig(data, surroundings, chosen, seed, limit)
+    count = len(config.list_trips())
+    table = drive_true_world(config, out, work.runner(jobs, work.on_error) or choose_runner(jobs, count))
+    episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
+    for line in write_report(episodes, [s.name for s in learned], out):
+        print_line(f"* {line}")
+    print_line(out / "report.md")
