@@ -30,6 +30,10 @@ class DataError(RlftsimError):
     """A file, record or scenario that cannot be used; the message names the file, the record and the reason."""
 
 
+class EpisodeFailure(DataError):
+    """An episode that cannot be driven to the end, by a fault of the planner or of the traffic."""
+
+
 class BadRecordError(DataError):
     """A damaged record in a conversion that stops at the first one; the message names file, record and cause."""
 

@@ -13,11 +13,11 @@ import numpy as np
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, PlannerFailure, guard_planner, load_planner, read_action_settings
+from rlftsim.envs.planners.registry import Planner, guard_planner, load_planner, read_action_settings
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
-from rlftsim.errors import ConfigError, in_short, whole_number
+from rlftsim.errors import ConfigError, EpisodeFailure, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED, DriveResult, find_failures, is_failure, rank_scenarios
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
@@ -83,7 +83,8 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
         rollout: Number of the rollout, 0 or more; each with dice of its own.
 
     Raises:
-        PlannerFailure: The planner raises an error, calls exit(), or wants what its type of action does not allow.
+        EpisodeFailure: SUMO fails, or the planner raises an error, calls exit(), or wants what its type of action does
+            not allow.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
     with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
@@ -104,7 +105,7 @@ def drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], positi
     rollouts = range(config.num_rollouts)
     try:
         results = [run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in rollouts]
-    except PlannerFailure as failure:  # of one rollout counts for the scenario
+    except EpisodeFailure as failure:  # of one rollout counts for the scenario
         row = {"scenario_id": ids[position], "traffic": traffic, **dict.fromkeys(ROW_SCORES, math.nan)}
         return {"row": row, "missing": {FAILED: str(failure)}}
     rows = [result.scores for result in results]
@@ -152,7 +153,7 @@ def write_film(config: DriveConfig, scenario_id: str, out: Path) -> Path:
         out: Folder for the film SCENARIO.webp.
 
     Raises:
-        PlannerFailure: The planner fails in this scenario.
+        EpisodeFailure: The planner or SUMO fails in this scenario.
     """
     records, scores = {}, []
     for traffic in config.traffic:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from rlftsim.envs.scene import GREEN, RED, YELLOW, Lights, Scene
-from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.errors import ConfigError, DataError, EpisodeFailure
 from rlftsim.jobs.documents import parse_json
 from rlftsim.scenario.synthetic.causal import BodyState, SumoPose, advance_body
 from rlftsim.scenario.synthetic.crop import on_grid
@@ -37,10 +37,6 @@ COLORS = {"G": GREEN, "g": GREEN, "y": YELLOW, "Y": YELLOW}
 """Of SUMO's letters; all others mean red."""
 Poses = tuple[SumoPose | None, ...]
 """SUMO's pose of the ego at each step after the current one; None = SUMO drives it."""
-
-
-class SumoFailure(RlftsimError):
-    """SUMO has failed in an episode twice: for lack of memory, or by a fault of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +182,7 @@ class SumoWorld:
             poses: All poses of the ego since the current step, at least one.
 
         Raises:
-            SumoFailure: The process has failed twice.
+            EpisodeFailure: The process has failed twice.
         """
         reason = ""
         for _ in range(2):  # a process that was killed, perhaps for memory: all its states can be made again
@@ -194,7 +190,9 @@ class SumoWorld:
                 return self._step(window, poses)
             except (OSError, EOFError):
                 reason = self.close()
-        raise SumoFailure(f"SUMO has failed twice in {self.path} ({reason}): free memory, or {REMEDY}.")
+        raise EpisodeFailure(
+            f"SUMO has failed twice in {self.path} ({reason}): free memory, or leave the scenario out."
+        )
 
     def _step(self, window: int, poses: Poses) -> dict[str, Any]:
         channel, new_poses = self.channels.pop((window, poses[:-1]), None), poses[-1:]

@@ -17,10 +17,9 @@ from rlftsim.envs.drivers import Traffic
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.episode import Episode, ScenarioGoals
 from rlftsim.envs.planner_scores import PlannerScores
-from rlftsim.envs.planners.registry import PlannerFailure, load_planner, read_action_settings
+from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.source import Source
-from rlftsim.envs.sumo_traffic import SumoFailure
-from rlftsim.errors import ConfigError, in_short
+from rlftsim.errors import ConfigError, EpisodeFailure, in_short
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
@@ -101,7 +100,7 @@ class Trip:
         }  # fmt: skip
         try:
             result = run_planner(env, planner, scenario, seed=self.seed)
-        except (PlannerFailure, SumoFailure) as failure:
+        except EpisodeFailure as failure:
             log.warning(str(failure))
             return {"row": row | dict.fromkeys((*SCORES, *COUNTS), math.nan)}
         record, sumo_states = result.record, env.state.world.sumo_states

@@ -14,7 +14,7 @@ from functools import cache, partial
 from typing import Any, Protocol, get_args, runtime_checkable
 
 from rlftsim.envs.actions import MIN_HORIZON, ActionType
-from rlftsim.errors import ConfigError, DataError, RlftsimError, in_short, locate_error
+from rlftsim.errors import ConfigError, EpisodeFailure, RlftsimError, in_short, locate_error
 from rlftsim.plugins import ExtensionPoint, import_object
 from rlftsim.scenario.shards import hash_file
 
@@ -158,7 +158,7 @@ def to_planner(planner: Any, name: str = "planner") -> Planner:
     return CallablePlanner(planner)
 
 
-class PlannerFailure(DataError):
+class PlannerFailure(EpisodeFailure):
     """A planner cannot drive a scenario."""
 
 
