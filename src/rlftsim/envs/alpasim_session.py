@@ -290,7 +290,7 @@ class Session:
         """Motion of the ego at a time, map frame."""
         previous, current = self.ego_path.at(np.array([time_us - STEP_US, time_us]))
         velocity = (current[:2] - previous[:2]) / STEP_S
-        return np.concatenate([current[:2] - self.world.scenes[0].scenario.origin, [wrapped(current[3])], velocity])
+        return np.concatenate([current[:2] - self.world.scenes[0].scenario.origin, wrapped(current[3:]), velocity])
 
     def _collect_paths(self, query_us: int) -> Iterable[tuple[str, Path | None]]:
         """Path of each object from the query on; None for an object without a pose then."""
