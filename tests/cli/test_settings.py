@@ -166,7 +166,7 @@ BAD = [
     (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
     (
         ["join"],
-        "^join: write the command of a share behind join, .* are augment, convert, evaluate, experiment true-world, failures, score,",
+        "^join: write the command of a share behind join, .* evaluate, experiment true-world, failures, score,",
     ),
     (["join", "foo"], "^join foo: write the command of a share behind join"),
     (["join", "pretrain", "--help"], "^join pretrain --help: write the command of a share behind join"),
