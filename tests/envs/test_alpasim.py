@@ -271,6 +271,24 @@ def test_times_between_the_steps_are_interpolated_and_before_the_handover_the_lo
             assert (pose.pose.vec.x, pose.pose.vec.y) == pytest.approx(expected[:2], abs=1e-3)
 
 
+def test_a_plan_of_the_ego_is_replaced_by_where_it_goes(served, data):
+    client, _ = served
+    path = straight_on(data[0])
+    motions = []
+    for plan_steps in ([1], [1, 5, 40]):
+        uuid = f"plan-{len(plan_steps)}"
+        client.call(
+            "start_session", session_uuid=uuid, scene_id=data[0].scenario_id, random_seed=0,
+            handover_time_us=HANDOVER_US, logged_object_trajectories=list_objects(data[0]),
+        )  # fmt: skip
+        times = [HANDOVER_US + step * 100_000 for step in plan_steps]
+        places = [path.ego_path[1][0] + np.array([9.0 * (step > 1), 0, 0]) for step in plan_steps]
+        plan = M["Update"](object_id="EGO", trajectory=poses(times, places, np.full(len(times), path.ego_path[1][1])))
+        client.call("simulate", session_uuid=uuid, time_query_us=times[0], object_trajectory_updates=[plan])
+        motions.append(np.array([read(answer) for answer in drive(client, path, uuid, range(2, 31))]))
+    assert difference(*motions) < 1e-6
+
+
 def test_two_sessions_at_once_do_not_touch_each_other(served, data):
     client, _ = served
     answers = {}
@@ -290,7 +308,7 @@ def test_two_sessions_at_once_do_not_touch_each_other(served, data):
         assert all((read(a) == b).all() for a, b in zip(alone, answers[number]))
 
 
-def test_every_mistake_has_its_status(served, data):
+def test_every_mistake_has_its_status(served, data, monkeypatch):
     client, service = served
     scenario = data[0]
     objects = list_objects(scenario)
@@ -306,10 +324,13 @@ def test_every_mistake_has_its_status(served, data):
     broken[1].trajectory.poses[0].pose.vec.x = float("nan")
     flat = [M["ObjectTrajectory"].FromString(o.SerializeToString()) for o in objects]
     flat[2].aabb.size_y = 0
+    turned = [M["ObjectTrajectory"].FromString(o.SerializeToString()) for o in objects]
+    turned[1].trajectory.poses[0].pose.ClearField("quat")
     for change in (
         {"session_uuid": ""}, {"scene_id": ""}, {"logged_object_trajectories": []}, {"handover_time_us": 0},
         {"logged_object_trajectories": no_ego}, {"logged_object_trajectories": broken},
         {"logged_object_trajectories": twice}, {"logged_object_trajectories": flat},
+        {"logged_object_trajectories": turned},
         {"handover_time_us": HANDOVER_US + 50_000_000},
     ):  # fmt: skip
         assert client.fails("start_session", **(fields | change)) == "INVALID_ARGUMENT", change
@@ -326,6 +347,9 @@ def test_every_mistake_has_its_status(served, data):
     service.sessions["m"].state = None  # an error of the code
     assert client.fails("simulate", session_uuid="m", time_query_us=HANDOVER_US + 8_000_000) == "INTERNAL"
     client.call("close_session", session_uuid="m")
+    monkeypatch.setattr(alpasim_service, "MAX_SESSIONS", 0)
+    assert client.fails("start_session", **fields) == "RESOURCE_EXHAUSTED"
+    monkeypatch.undo()
     server, other, _ = serve(load_policy("demo-base"), None)
     assert other.fails("start_session", **fields) == "FAILED_PRECONDITION"  # no map: nothing is made up
     server.stop(None).wait()

@@ -107,6 +107,10 @@ def forget_sizes(scenes):
             agent.ClearField(name)
 
 
+def lose_a_width(scenes):
+    agents(scenes)[3].width[7] = float("nan")
+
+
 def forget_a_type(scenes):
     agents(scenes)[5].ClearField("object_type")
 
@@ -120,6 +124,7 @@ def leave_a_scene_out(scenes):
     [
         (cut_to_80_steps, r"check 4: .* have \[80, 80, 80, 80\] steps"),
         (forget_sizes, r"check 19: .*width, length and height have \[0, 0, 0\] steps"),
+        (lose_a_width, r"check 19: .*width, length or height is no number above 0 in scene 0"),
         (forget_a_type, r"check 19: .*an agent has no object_type"),
         (leave_a_scene_out, r"check 3: .*31 scenes instead of 32"),
     ],

@@ -21,6 +21,10 @@ API_VERSION = (0, 54, 0)
 """Version of AlpaSim's messages that `alpasim.proto` follows."""
 
 
+MAX_SESSIONS = 1000
+"""Sessions that may be open at once: clients that end without a word leave theirs."""
+
+
 class TrafficService:
     """The five methods of the service.
 
@@ -90,6 +94,8 @@ class TrafficService:
     def _check_free(self, session_uuid: str) -> None:
         if session_uuid in self.sessions:
             raise RequestError("ALREADY_EXISTS", f"session {in_short(session_uuid)} is open: close it first")
+        if len(self.sessions) >= MAX_SESSIONS:
+            raise RequestError("RESOURCE_EXHAUSTED", f"{MAX_SESSIONS} sessions are open: close those that have ended")
 
     def _find_scene(self, scene_id: str) -> Scenario | None:
         if self.data is None:

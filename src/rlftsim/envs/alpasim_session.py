@@ -99,15 +99,16 @@ def read_path(trajectory: alpasim_pb2.Trajectory, object_id: str) -> Path:
         RequestError: No pose, times that do not rise, or a number that is not finite.
     """
     poses = [(p.pose.vec, p.pose.quat, p.timestamp_us) for p in trajectory.poses]
-    time_us = np.array([time for *_, time in poses], np.int64)
-    if not poses or (np.diff(time_us) <= 0).any():
+    time_us = np.array([time for *_, time in poses], np.uint64).astype(np.int64)
+    if not poses or (np.diff(time_us) <= 0).any() or (time_us < 0).any():
         raise RequestError("INVALID_ARGUMENT", f"object {in_short(object_id)} has no poses, or times that do not rise")
     x, y, z = np.array([(vec.x, vec.y, vec.z) for vec, *_ in poses]).T
     w, i, j, k = np.array([(quat.w, quat.x, quat.y, quat.z) for _, quat, _ in poses]).T
     heading = np.unwrap(np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k)))
     pose = np.stack([x, y, z, heading], -1)
-    if not np.isfinite(pose).all():
-        raise RequestError("INVALID_ARGUMENT", f"object {in_short(object_id)} has a pose that is not finite")
+    if not (np.isfinite(pose).all() and (np.abs(w * w + i * i + j * j + k * k - 1) < 1e-2).all()):
+        text = f"object {in_short(object_id)} has a pose that is not finite, or a quaternion that is not of length 1"
+        raise RequestError("INVALID_ARGUMENT", text)
     return Path(time_us, pose)
 
 
@@ -268,11 +269,13 @@ class Session:
         return [(name, path) for name, path in paths if path is not None]
 
     def _extend_ego_path(self, update: Path) -> None:
-        """Append the poses of an update; poses of the past do not change."""
-        is_new = update.time_us > self.ego_path.time_us[-1]
-        joined = np.concatenate([self.ego_path.pose, update.pose[is_new]])
+        """Append the poses of an update, which replace a plan; poses that the world has stepped by do not change."""
+        now_us = self.handover_us + self.state.step * STEP_US
+        is_new, is_past = update.time_us > now_us, self.ego_path.time_us <= now_us
+        is_past |= self.ego_path.time_us < update.time_us[is_new].min(initial=np.iinfo(np.int64).max)
+        joined = np.concatenate([self.ego_path.pose[is_past], update.pose[is_new]])
         joined[:, 3] = np.unwrap(joined[:, 3])
-        self.ego_path = Path(np.append(self.ego_path.time_us, update.time_us[is_new]), joined)
+        self.ego_path = Path(np.append(self.ego_path.time_us[is_past], update.time_us[is_new]), joined)
 
     def _advance(self, query_us: int) -> None:
         """Step the world to the last step before the query, and decide the next steps."""

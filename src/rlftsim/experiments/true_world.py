@@ -92,8 +92,10 @@ def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int, seed: int = 0) 
         seed: Seed of the draws.
     """
     count = int(clusters.max()) + 1
+    if count == 1:  # a single network says nothing about others
+        return np.concatenate([np.ones((1, len(clusters))), np.full((num_draws, len(clusters)), np.nan)])
     rng = np.random.default_rng(seed)
-    draws = rng.multinomial(max(count - 1, 1), np.full(count, 1 / count), num_draws)
+    draws = rng.multinomial(count - 1, np.full(count, 1 / count), num_draws)
     return np.concatenate([np.ones((1, len(clusters))), draws[:, clusters]])
 
 

@@ -28,7 +28,6 @@ SCORE, HIT, AT_FAULT = "nuplan_style", "hit_rate", "at_fault_collision_rate"
 DISTANCES_M = (0.0, 1.0, 5.0, 15.0, np.inf)
 REFERENCES = ("replay", "idm")
 GHOST = "ghost"
-AIMS = {"tau_b": 0.9, "at_fault": 0.03, "random": 0.02}
 MAX_COLORS = len(COLORS)
 
 

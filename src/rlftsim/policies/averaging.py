@@ -43,7 +43,7 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
         raise ConfigError(f"scale={scale:g} needs the base that the policies were fine-tuned from.")
     first = policies[0]
     if isinstance(first, CalibratedPolicy) and base is not None and not isinstance(base, CalibratedPolicy):
-        base = CalibratedPolicy(base, first.features)  # with weights of 0
+        base = CalibratedPolicy(base, first.features).to(first.eta.device)  # with weights of 0
     for number, policy in enumerate(policies, 1):
         _check_same_settings(first, policy, f"policy {number} of {len(policies)}")
     if base is not None:
@@ -61,7 +61,7 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
                 raise ConfigError(f"{name} is not finite in the average with scale={scale:g}.")
     if isinstance(average, CalibratedPolicy):
         accounts = [policy.calibration for policy in policies]
-        average.set_calibration(average.eta, average_calibrations(accounts, scale))
+        average.set_calibration(average.eta, average_calibrations(accounts, scale, average.eta.tolist()))
     return average
 
 

@@ -107,4 +107,4 @@ def _draw_history(
     if object_type == ObjectType.PEDESTRIAN:
         side = rng.choice((-1, 1)) * rng.uniform(*SIDE_M)
         x, y = x - np.sin(heading) * side, y + np.cos(heading) * side
-    return np.stack([x, y, z, heading], -1)
+    return np.stack([x, y, z, np.arctan2(np.sin(heading), np.cos(heading))], -1)

@@ -146,6 +146,10 @@ def check_rollouts(
         if doubt.subject == "not finite":
             return ScenarioCheck(tuple(findings))
     if challenge.makes_scenes:
+        sizes = decoded.values[:, :, len(AXES) :]  # [scenes, agents, 3, steps]
+        for scene, row in np.argwhere(~(np.isfinite(sizes) & (sizes > 0)).all((2, 3)))[:1]:
+            text = f"width, length or height is no number above 0 in scene {scene}"
+            findings.append(Finding(19, "error", text, file, decoded.scenario_id, decoded.object_ids[scene][row]))
         findings += _find_history(decoded.object_ids[0], poses, scenario, file)
         return ScenarioCheck(tuple(findings), poses.shape[0] * poses.shape[1])
     error = checks.first_step_errors()

@@ -167,16 +167,20 @@ def measure_run(words: list[str], out: Path, num_updates: int) -> MeasuredRun:
         command = [sys.executable, "-m", "rlftsim", *words]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
         is_stopped, moments = False, []
-        while True:
-            done, status, usage = os.wait4(process.pid, os.WNOHANG)
-            num_done = len(read_metrics(out)) if out.exists() else 0
-            moments += [time.monotonic()] * (num_done - len(moments))
-            if done:
-                break
-            if num_done >= num_updates and not is_stopped:
-                is_stopped = True
-                process.send_signal(signal.SIGTERM)
-            time.sleep(SECONDS_BETWEEN_LOOKS)
+        try:
+            while True:
+                done, status, usage = os.wait4(process.pid, os.WNOHANG)
+                num_done = len(read_metrics(out)) if out.exists() else 0
+                moments += [time.monotonic()] * (num_done - len(moments))
+                if done:
+                    break
+                if num_done >= num_updates and not is_stopped:
+                    is_stopped = True
+                    process.send_signal(signal.SIGTERM)
+                time.sleep(SECONDS_BETWEEN_LOOKS)
+        except BaseException:  # stopped: else the training would go on by itself
+            process.terminate()
+            raise
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode == -signal.SIGKILL:
             raise DataError(f"{' '.join(words)}: was killed, as where memory ends: take a smaller micro batch.")

@@ -97,20 +97,23 @@ Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "noth
 {measured if lengths else ""}"""
 
 
-def average_calibrations(calibrations: Sequence[Mapping[str, Any]], scale: float) -> dict[str, Any]:
-    """Account of the mean of several calibrations; empty where one of these has none.
+def average_calibrations(
+    calibrations: Sequence[Mapping[str, Any]], scale: float, eta: Sequence[float]
+) -> dict[str, Any]:
+    """Account of the mean of several calibrations, with means of the runs; empty where one of these has none.
 
     Args:
         calibrations: Values of calibration.json of runs with the same features.
         scale: Length of the step from the base to the mean.
+        eta: Weights of the mean, in the order of the features.
     """
     if not all(calibrations):
         return {}
     table = []
-    for rows in zip(*(calibration["features"] for calibration in calibrations)):
+    for weight, rows in zip(eta, zip(*(calibration["features"] for calibration in calibrations))):
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0] if name != "feature"}
         scaled = {name: mean if name == "t" else scale * mean for name, mean in means.items()}
-        table.append({"feature": rows[0]["feature"], **scaled})
+        table.append({"feature": rows[0]["feature"], **scaled, "eta": weight})
     # what the runs measured on scenarios held back is not true of the mean
     return {**calibrations[0], "length": scale, "features": table, "held_back": []}
 
