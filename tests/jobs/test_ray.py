@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import shlex
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -42,6 +43,7 @@ def cluster():
 
     folders = [str(PACKAGE.parent), str(Path(__file__).parents[1])]
     before = os.environ.get("PYTHONPATH")
+    handler = signal.getsignal(signal.SIGTERM)
     os.environ["PYTHONPATH"] = os.pathsep.join(folders)  # for the processes of the cluster
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     small = {"object_store_memory": 80_000_000, "include_dashboard": False}
@@ -50,13 +52,15 @@ def cluster():
         for _ in range(2):
             cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
     except Exception as error:
-        if "timed out during startup" not in str(error):
+        signal.signal(signal.SIGTERM, handler)
+        if "timed out" not in str(error).lower():
             raise
         pytest.skip("this machine is too busy: Ray gives a raylet 30 seconds to start")
     ray.init(cluster.address, log_to_driver=False)
     yield cluster
     ray.shutdown()
     cluster.shutdown()
+    signal.signal(signal.SIGTERM, handler)  # Ray leaves its own, which ends the process of the tests that follow
     os.environ.pop("PYTHONPATH")
     if before is not None:
         os.environ["PYTHONPATH"] = before

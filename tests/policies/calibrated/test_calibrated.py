@@ -226,7 +226,7 @@ def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_wh
             "held_back": [held_back],
         }  # fmt: skip
         runs.append(CalibratedPolicy(base, ["speed_fast"], [eta], account))
-    average_policies(runs, base=base, scale=3).save_pretrained(tmp_path)
+    average_policies(runs, base=base, scale=3.0).save_pretrained(tmp_path)
     average = load_policy(tmp_path)
     assert average.eta.tolist() == pytest.approx([0.9])
     row = average.calibration["features"][0]
