@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Int64, Shaped
 from scipy import stats
 
 
@@ -69,6 +69,17 @@ def prediction_interval(values: Shaped[np.ndarray, "n"], *, alpha: float = 0.05)
     return interval_around(mean.mean, error, mean.count, alpha=alpha)
 
 
+def draw_clusters(count: int, num_draws: int, rng: np.random.Generator) -> Int64[np.ndarray, "draws count"]:
+    """How often each draw takes each of at least two clusters: one draw fewer than there are (Rao and Wu 1988).
+
+    Args:
+        count: Number of clusters.
+        num_draws: Number of bootstrap draws.
+        rng: Source of the draws.
+    """
+    return rng.multinomial(count - 1, np.full(count, 1 / count), num_draws)
+
+
 def cluster_bootstrap(
     values: Shaped[np.ndarray, "*runs n"],
     clusters: Shaped[np.ndarray, "n"],
@@ -115,7 +126,7 @@ def cluster_bootstrap(
     num_draws = min(num_draws, max(20_000_000 // num_clusters, 400))
     rng = np.random.default_rng(seed)
     drawn = [
-        rng.multinomial(size - 1, np.full(size, 1 / size), num_draws) if size > 1 else np.ones((num_draws, 1))
+        draw_clusters(size, num_draws, rng) if size > 1 else np.ones((num_draws, 1))
         for size in (num_runs, num_clusters)
     ]  # [draws, R], [draws, G]
 

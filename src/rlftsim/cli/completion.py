@@ -4,9 +4,9 @@ import io
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
 
-from rlftsim.cli.parse import parse
+from rlftsim.cli.parse import find_command, list_actions, parse
 from rlftsim.cli.signatures import FLAG
-from rlftsim.verbs.commands import COMMANDS, VERBS
+from rlftsim.verbs.commands import VERBS
 
 SCRIPT = """\
 [ -n "$ZSH_VERSION" ] && autoload -U +X bashcompinit && bashcompinit
@@ -28,8 +28,7 @@ def list_next_words(words: Sequence[str]) -> list[str]:
     """
     if not words:
         return list(VERBS)
-    actions = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{words[0]} ")]
-    name = next((name for name in (" ".join(words[:2]), words[0]) if name in COMMANDS), None)
+    actions, name = list_actions(words[0]), find_command(words)
     text = io.StringIO()
     if name is not None:
         with redirect_stdout(text), suppress(SystemExit):

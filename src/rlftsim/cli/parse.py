@@ -47,7 +47,7 @@ def parse(words: Sequence[str]) -> Call:
     """
     # switches that may be left out get the value that tyro expects
     words = list(chain.from_iterable(["--goal-logit-bias", EITHER_OR[w]] if w in EITHER_OR else [w] for w in words))
-    name = next((name for name in (" ".join(words[:2]), words[0]) if name in COMMANDS), None)
+    name = find_command(words)
     if name is None:
         _explain_actions(words[0], words[1:])
     arguments = words[len(name.split()) :]
@@ -63,9 +63,19 @@ def parse(words: Sequence[str]) -> Call:
     return _parse_call(name, arguments)
 
 
+def find_command(words: Sequence[str]) -> str | None:
+    """Command that words begin with, a verb or a verb with an action; None if there is none."""
+    return next((name for name in (" ".join(words[:2]), words[0]) if name in COMMANDS), None)
+
+
+def list_actions(verb: str) -> list[str]:
+    """Actions of a verb."""
+    return [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{verb} ")]
+
+
 def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
     """Print the actions of a verb, or say that one is missing or unknown."""
-    actions = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{verb} ")]
+    actions = list_actions(verb)
     if not any(word in HELP for word in words):
         raise ConfigError(explain_action(words, actions))
     with stand_ins():

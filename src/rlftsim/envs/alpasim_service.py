@@ -19,8 +19,6 @@ MAX_MESSAGE_BYTES = 16 << 20
 NUM_THREADS = 8
 API_VERSION = (0, 54, 0)
 """Version of AlpaSim's messages that `alpasim.proto` follows."""
-
-
 MAX_SESSIONS = 1000
 """Sessions that may be open at once: clients that end without a word leave theirs."""
 

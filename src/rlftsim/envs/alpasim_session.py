@@ -20,6 +20,7 @@ from rlftsim.envs.world import Dice, WorldState, begin, build_world, step_world
 from rlftsim.errors import RlftsimError, in_short
 from rlftsim.geometry import wrapped
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.types import (
     CURRENT_STEP,
@@ -58,7 +59,7 @@ class RequestError(RlftsimError):
         self.status = status
 
 
-class Path(NamedTuple):
+class PosePath(NamedTuple):
     """Poses of an object over time."""
 
     time_us: Int64[np.ndarray, "n"]
@@ -88,8 +89,8 @@ class Path(NamedTuple):
         return (self.time_us[0] <= time_us) & (time_us <= self.time_us[-1])
 
 
-def read_path(trajectory: alpasim_pb2.Trajectory, object_id: str) -> Path:
-    """Path of a message.
+def read_path(trajectory: alpasim_pb2.Trajectory, object_id: str) -> PosePath:
+    """PosePath of a message.
 
     Args:
         trajectory: Poses in the local frame.
@@ -109,10 +110,10 @@ def read_path(trajectory: alpasim_pb2.Trajectory, object_id: str) -> Path:
     if not (np.isfinite(pose).all() and (np.abs(w * w + i * i + j * j + k * k - 1) < 1e-2).all()):
         text = f"object {in_short(object_id)} has a pose that is not finite, or a quaternion that is not of length 1"
         raise RequestError("INVALID_ARGUMENT", text)
-    return Path(time_us, pose)
+    return PosePath(time_us, pose)
 
 
-def write_path(path: Path) -> alpasim_pb2.Trajectory:
+def write_path(path: PosePath) -> alpasim_pb2.Trajectory:
     """Message of a path."""
     trajectory = alpasim_pb2.Trajectory()
     half = path.pose[:, 3] / 2
@@ -130,7 +131,7 @@ class LoggedObject:
     object_type: ObjectType
     size: tuple[float, float, float]
     is_static: bool
-    path: Path
+    path: PosePath
 
 
 def read_objects(messages: Iterable[alpasim_pb2.ObjectTrajectory]) -> list[LoggedObject]:
@@ -181,17 +182,12 @@ def build_session_scenario(
         size=np.repeat(size[:, None], HISTORY_STEPS, 1),
         valid=is_covered | is_static[:, None],
     )
-    lights = LightStates.of([])
-    if scene is not None:
-        is_past = scene.lights.step < HISTORY_STEPS
-        names = ("step", "lane_id", "state", "stop_point")
-        lights = LightStates(*(getattr(scene.lights, name)[is_past] for name in names))
     return Scenario(
         scenario_id=scene_id,
         timestamps_s=STEP_S * np.arange(HISTORY_STEPS),
         tracks=tracks,
         map_features=MapFeatures.of([]) if scene is None else scene.map_features,
-        lights=lights,
+        lights=LightStates.of([]) if scene is None else without_future(scene).lights,
         ego_index=[logged.object_id for logged in objects].index(EGO),
         tracks_to_predict=np.zeros(0, np.int32),
         difficulty=np.zeros(0, np.int8),
@@ -236,14 +232,16 @@ class Session:
         """One step later, but for the ego, whose pose then is not known yet."""
         self.lock = threading.Lock()
 
-    def _cut_ego_path(self) -> Path:
+    def _cut_ego_path(self) -> PosePath:
         """The ego's log up to the handover: later poses are the client's to say."""
         path = next(logged.path for logged in self.objects if logged.object_id == EGO)
         is_past = path.time_us < self.handover_us
         current = path.at(np.array([self.handover_us]))
-        return Path(np.append(path.time_us[is_past], self.handover_us), np.concatenate([path.pose[is_past], current]))
+        return PosePath(
+            np.append(path.time_us[is_past], self.handover_us), np.concatenate([path.pose[is_past], current])
+        )
 
-    def simulate(self, query_us: int, updates: Iterable[alpasim_pb2.ObjectUpdate]) -> list[tuple[str, Path]]:
+    def simulate(self, query_us: int, updates: Iterable[alpasim_pb2.ObjectUpdate]) -> list[tuple[str, PosePath]]:
         """Pose of each object but the ego at a time, and the poses after it that are decided already.
 
         Args:
@@ -268,14 +266,14 @@ class Session:
             paths = self._collect_paths(query_us)
         return [(name, path) for name, path in paths if path is not None]
 
-    def _extend_ego_path(self, update: Path) -> None:
+    def _extend_ego_path(self, update: PosePath) -> None:
         """Append the poses of an update, which replace a plan; poses that the world has stepped by do not change."""
         now_us = self.handover_us + self.state.step * STEP_US
         is_new, is_past = update.time_us > now_us, self.ego_path.time_us <= now_us
         is_past |= self.ego_path.time_us < update.time_us[is_new].min(initial=np.iinfo(np.int64).max)
         joined = np.concatenate([self.ego_path.pose[is_past], update.pose[is_new]])
         joined[:, 3] = np.unwrap(joined[:, 3])
-        self.ego_path = Path(np.append(self.ego_path.time_us[is_past], update.time_us[is_new]), joined)
+        self.ego_path = PosePath(np.append(self.ego_path.time_us[is_past], update.time_us[is_new]), joined)
 
     def _advance(self, query_us: int) -> None:
         """Step the world to the last step before the query, and decide the next steps."""
@@ -295,8 +293,8 @@ class Session:
         velocity = (current[:2] - previous[:2]) / STEP_S
         return np.concatenate([current[:2] - self.world.scenes[0].scenario.origin, wrapped(current[3:]), velocity])
 
-    def _collect_paths(self, query_us: int) -> Iterable[tuple[str, Path | None]]:
-        """Path of each object from the query on; None for an object without a pose then."""
+    def _collect_paths(self, query_us: int) -> Iterable[tuple[str, PosePath | None]]:
+        """PosePath of each object from the query on; None for an object without a pose then."""
         is_logged = query_us <= self.handover_us
         simulated = None if is_logged else self._collect_poses(query_us)
         for logged in self.objects:
@@ -305,10 +303,10 @@ class Session:
             row = self.rows.get(logged.object_id)
             if simulated is not None and row is not None and self.world.drivers[0, row] == Driver.POLICY:
                 times, poses = simulated
-                yield logged.object_id, Path(times, poses[row])
+                yield logged.object_id, PosePath(times, poses[row])
             elif logged.is_static or logged.path.covers(query_us):
                 times = np.array([query_us])
-                yield logged.object_id, Path(times, logged.path.at(times))
+                yield logged.object_id, PosePath(times, logged.path.at(times))
             else:
                 yield logged.object_id, None
 
@@ -328,4 +326,4 @@ class Session:
         pose = np.concatenate([position, height[..., None], heading[..., None]], -1)
         step_us = self.handover_us + STEP_US * np.arange(pose.shape[1])
         times = np.append(query_us, step_us[step_us > query_us])
-        return times, np.stack([Path(step_us, agent).at(times) for agent in pose])
+        return times, np.stack([PosePath(step_us, agent).at(times) for agent in pose])

@@ -18,7 +18,6 @@ from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 
 FOLLOWING, MERGING, CROSSING, PEDESTRIAN = "following", "merging", "crossing", "pedestrian"
-CONFLICTS = (FOLLOWING, MERGING, CROSSING, PEDESTRIAN)
 HEADWAY_S, HORIZON_S = 2.0, 4.0
 LEAST_REACH_M = 20.0
 """Road users that stand may drive off: all look at least so far ahead."""
@@ -32,7 +31,7 @@ MOVING_MPS = 0.5
 
 
 def find_conflicts(scenario: Scenario, data: Path) -> frozenset[str]:
-    """Conflicts of the ego with road users that SUMO drives, among `CONFLICTS`.
+    """Conflicts of the ego with road users that SUMO drives: any of "following" to "pedestrian".
 
     Following: a vehicle less than 2 s behind the ego in the same lane. Merging and crossing: a vehicle whose lane joins
     or crosses the ego's route, where both are within 4 s at present speeds, or within 20 m. Pedestrian: a walker who is

@@ -6,7 +6,7 @@ stopped has measured the same of every planner.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -64,7 +64,8 @@ class TrueWorldConfig:
             if len({*names}) < len(names):
                 raise ConfigError(f"{label}: two of {', '.join(names)} have the same name: leave one out.")
 
-    def list_trips(self) -> list[Trip]:
+    @cached_property
+    def trips(self) -> list[Trip]:
         """All episodes, window by window, a window of each network in turn.
 
         Raises:
@@ -96,7 +97,7 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
         SetAside, Unfinished: See `run_items`.
     """
     check_folder(out, "results")
-    trips = config.list_trips()
+    trips = config.trips
     codes = {trip.planner: hash_code(trip.planner_name) for trip in trips[: len(config.planners)]}
     models = {s.name: fingerprint_policy(load_model(s.model)) for s in config.surroundings if s.traffic == "policy"}
     manifest = hash_manifest(dataset_folder(config.data))

@@ -67,8 +67,7 @@ def measure_drift(scenario: Scenario, states: SimulatedStates) -> Drift:
     """
     # 1. Agents in the order of the scenario's tracks, from the current step on.
     tracks, everyone = scenario.tracks, scenario.simulated_indices
-    order = np.argsort(states.object_id)
-    rows = order[np.searchsorted(states.object_id[order], tracks.object_id[everyone])]
+    rows = states.find_rows(tracks.object_id[everyone])
     x, y, angle = (v.cpu().numpy()[:, rows].astype(np.float64) for v in (states.x, states.y, states.heading))
     start = np.broadcast_to(tracks.position[everyone, CURRENT_STEP, :2], (len(x), len(everyone), 2))  # [N, A, 2]
     position = np.concatenate([start[:, :, None], np.stack([x, y], -1)], 2)  # [N, A, 81, 2]

@@ -31,7 +31,7 @@ def write_gpudrive(scenario: Scenario, states: SimulatedStates, folder: Path) ->
     """
     simulated = scenario.simulated_indices
     tracks = scenario.tracks.select(simulated)
-    order = np.argsort(states.object_id)[np.searchsorted(np.sort(states.object_id), tracks.object_id)]
+    order = states.find_rows(tracks.object_id)
     poses = torch.stack([states.x, states.y, states.z, states.heading], -1)[:, order].cpu().numpy()
     history = slice(HISTORY_STEPS)
     index = {track: row for row, track in enumerate(simulated.tolist())}

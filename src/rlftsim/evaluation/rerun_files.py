@@ -45,7 +45,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
 
     path = folder / f"{scenario.scenario_id}.rrd"
     tracks, origin = scenario.tracks.select(scenario.simulated_indices), np.append(scenario.origin, 0.0)
-    order = np.argsort(states.object_id)[np.searchsorted(np.sort(states.object_id), tracks.object_id)]
+    order = states.find_rows(tracks.object_id)
     future = torch.stack([states.x, states.y, states.z, states.heading], -1)[:MAX_ROLLOUTS, order].cpu().numpy()
     log = np.concatenate([tracks.position, tracks.heading[..., None]], -1)
     size = tracks.size[:, HISTORY_STEPS - 1]

@@ -72,7 +72,7 @@ class PoseChecks:
     ) -> None:
         tracks = scenario.tracks
         row_of_id = {int(tracks.object_id[row]): row for row in scenario.simulated_indices}
-        rows = [row_of_id[object_id] for object_id in object_ids]
+        rows = self.rows = [row_of_id[object_id] for object_id in object_ids]
         self.object_ids = object_ids
         self.poses = poses
         self.position = tracks.position[rows, CURRENT_STEP]  # [A, 3]

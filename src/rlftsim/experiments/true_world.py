@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rlftsim.errors import DataError
+from rlftsim.statistics import draw_clusters
 
 NUM_DRAWS = 2000
 CHANGED = 0.05
@@ -84,7 +85,7 @@ def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
 
 
 def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int, seed: int = 0) -> Float[np.ndarray, "D W"]:
-    """Equal weights, then weights of draws of clusters with replacement, one fewer than there are (Rao and Wu 1988).
+    """Equal weights, then weights of draws of clusters, see `draw_clusters`; NaN draws for a single cluster.
 
     Args:
         clusters: Number of each window's cluster, from 0 on.
@@ -94,8 +95,7 @@ def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int, seed: int = 0) 
     count = int(clusters.max()) + 1
     if count == 1:  # a single network says nothing about others
         return np.concatenate([np.ones((1, len(clusters))), np.full((num_draws, len(clusters)), np.nan)])
-    rng = np.random.default_rng(seed)
-    draws = rng.multinomial(count - 1, np.full(count, 1 / count), num_draws)
+    draws = draw_clusters(count, num_draws, np.random.default_rng(seed))
     return np.concatenate([np.ones((1, len(clusters))), draws[:, clusters]])
 
 
@@ -124,9 +124,8 @@ def pool(
         mask: True = the episode counts.
         weights: Weights of the windows.
     """
-    sums = np.einsum("tpw,dw->dt", np.where(mask, values, 0.0), weights)
-    counts = weights @ mask.sum(0)
-    return sums / np.where(counts > 0, counts, np.nan)[:, None]
+    joined = np.where(mask, values, 0.0).reshape(len(values), 1, -1)  # planners and windows on a single axis
+    return average(joined, mask.reshape(1, -1), np.tile(weights, len(mask)))[..., 0]
 
 
 def compute_tau_b(x: Float[np.ndarray, "*n P"], y: Float[np.ndarray, "*n P"]) -> Float[np.ndarray, "*n"]:

@@ -1,7 +1,7 @@
 """Tables, verdicts and the picture of planners in simulated traffic against the truth."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from rlftsim.experiments.results import format_origin
 from rlftsim.experiments.tables import TextTable
 from rlftsim.experiments.true_world import (
+    CHANGED,
     VEHICLE_CONFLICTS,
     Episodes,
     average,
@@ -27,8 +28,6 @@ from rlftsim.viewer.figure import COLORS, INK, save_figure
 SCORE, HIT, AT_FAULT = "nuplan_style", "hit_rate", "at_fault_collision_rate"
 DISTANCES_M = (0.0, 1.0, 5.0, 15.0, np.inf)
 REFERENCES = ("replay", "idm")
-GHOST = "ghost"
-MAX_COLORS = len(COLORS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +36,15 @@ class WindowSet:
 
     name: str
     episodes: Episodes
+    _memo: dict[str, dict[str, Float[np.ndarray, "D T"]]] = field(default_factory=dict)
+    """Statistics by score, which several tables show."""
 
-    def measure(
-        self, column: str, statistic: str, mask: Bool[np.ndarray, "P W"] | None = None
-    ) -> Float[np.ndarray, "D T"]:
+    def measure(self, column: str, statistic: str) -> Float[np.ndarray, "D T"]:
         """Statistic of a score for each draw and type of traffic, see `measure_agreement`."""
-        mask = self.episodes.is_measured if mask is None else self.episodes.is_measured & mask
-        return measure_agreement(self.episodes.values[column], mask, self.episodes.weights)[statistic]
+        episodes = self.episodes
+        if column not in self._memo:
+            self._memo[column] = measure_agreement(episodes.values[column], episodes.is_measured, episodes.weights)
+        return self._memo[column][statistic]
 
 
 def choose_sets(episodes: Episodes) -> list[WindowSet]:
@@ -59,6 +60,17 @@ def format_cell(draws: Float[np.ndarray, "D"], digits: int = 3, sign: str = "") 
     return f"{mean:{sign}.{digits}f} [{low:{sign}.{digits}f}, {high:{sign}.{digits}f}]" if np.isfinite(mean) else "–"
 
 
+def list_rows(episodes: Episodes, cells: Callable[[int], Sequence[str]]) -> tuple[tuple[str, ...], ...]:
+    """Rows of all types of traffic but the truth, of cells by the number of the type."""
+    return tuple((name, *cells(t)) for t, name in enumerate(episodes.traffic) if t)
+
+
+def pool_errors(episodes: Episodes, mask: Bool[np.ndarray, "P W"]) -> list[Float[np.ndarray, "D T"]]:
+    """Errors of an episode's score and hit rate, over the measured episodes of a mask."""
+    errors = [np.abs(episodes.values[column] - episodes.values[column][:1]) for column in (SCORE, HIT)]
+    return [pool(error, mask & episodes.is_measured, episodes.weights) for error in errors]
+
+
 def build_error_table(windows: WindowSet) -> TextTable:
     """Errors of the score, the hit rate and the rate of collisions at fault, in each traffic."""
     episodes = windows.episodes
@@ -71,19 +83,17 @@ def build_error_table(windows: WindowSet) -> TextTable:
     }  # fmt: skip
     tables = [windows.measure(column, statistic) for column, statistic in columns.values()]
     failures = count_failures(episodes.values[AT_FAULT] > 0, episodes.is_measured)
-    rows = [
-        (
-            name, *(format_cell(table[:, t], sign="+" if label == "bias" else "")
-            for label, table in zip(columns, tables)), " · ".join(map(str, failures[t])),
-        )
-        for t, name in enumerate(episodes.traffic) if t
-    ]  # fmt: skip
+
+    def format_errors(t: int) -> list[str]:
+        cells = [format_cell(table[:, t], sign="+" * (label == "bias")) for label, table in zip(columns, tables)]
+        return [*cells, " · ".join(map(str, failures[t]))]
+
     note = (
         f"{len(episodes.windows)} windows of {len({*episodes.networks})} networks × {len(episodes.planners)} planners, "
         "one rollout. Errors against the truth; 95 % intervals by bootstrap over networks, "
         "whose draws make absolute errors of means larger. Failures: at fault in both · missed · false."
     )
-    return TextTable(f"Errors, {windows.name}", ("", *columns, "failures"), tuple(rows), note)
+    return TextTable(f"Errors, {windows.name}", ("", *columns, "failures"), list_rows(episodes, format_errors), note)
 
 
 def build_paired_table(windows: WindowSet) -> TextTable:
@@ -98,28 +108,20 @@ def build_paired_table(windows: WindowSet) -> TextTable:
         )
         for name in references
     }
-    rows = [
-        (name, *(format_cell(table[:, t], sign="+") for table in measured.values()))
-        for t, name in enumerate(traffic)
-        if t
-    ]
+    rows = list_rows(windows.episodes, lambda t: [format_cell(table[:, t], sign="+") for table in measured.values()])
     note = "Below zero: smaller errors than those of the other traffic."
-    return TextTable(f"Paired differences of errors, {windows.name}", ("", *measured), tuple(rows), note)
+    return TextTable(f"Paired differences of errors, {windows.name}", ("", *measured), rows, note)
 
 
 def build_parts_table(
     windows: WindowSet, title: str, parts: Sequence[tuple[str, Bool[np.ndarray, "P W"]]]
 ) -> TextTable:
     """Errors of an episode's score and hit rate in parts of the episodes, a row for each traffic."""
-    episodes, rows = windows.episodes, []
-    masks = [mask & episodes.is_measured for _, mask in parts]
-    errors = [np.abs(episodes.values[column] - episodes.values[column][:1]) for column in (SCORE, HIT)]
-    tables = [pool(error, mask, episodes.weights) for mask in masks for error in errors]
-    for t, name in enumerate(episodes.traffic):
-        cells = [format_cell(table[:, t]) for table in tables]
-        rows += [(name, *(f"{score} · {hit}" for score, hit in zip(cells[::2], cells[1::2])))] if t else []
-    headings = [f"{label} ({int(mask.sum())} episodes)" for (label, _), mask in zip(parts, masks)]
-    return TextTable(title, ("", *headings), tuple(rows), "Error of the score · error of the hit rate of an episode.")
+    episodes = windows.episodes
+    tables = [pool_errors(episodes, mask) for _, mask in parts]
+    rows = list_rows(episodes, lambda t: [" · ".join(format_cell(table[:, t]) for table in pair) for pair in tables])
+    headings = [f"{label} ({int((mask & episodes.is_measured).sum())} episodes)" for label, mask in parts]
+    return TextTable(title, ("", *headings), rows, "Error of the score · error of the hit rate of an episode.")
 
 
 def list_distances(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
@@ -133,9 +135,9 @@ def list_distances(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"
 
 def list_conflicts(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
     """Episodes by the conflicts of their windows, which may have several."""
-    parts = [(name, {name}) for name in (*VEHICLE_CONFLICTS, "pedestrian")]
-    masks = [(name, np.array([bool(words & found) for found in episodes.conflicts])) for name, words in parts]
-    masks.append(("none", np.array([not found for found in episodes.conflicts])))
+    names = (*VEHICLE_CONFLICTS, "pedestrian")
+    masks = [(name, np.array([name in conflicts for conflicts in episodes.conflicts])) for name in names]
+    masks.append(("none", np.array([not conflicts for conflicts in episodes.conflicts])))
     return [(name, np.broadcast_to(mask, (len(episodes.planners), len(mask)))) for name, mask in masks]
 
 
@@ -147,22 +149,23 @@ def build_planner_table(windows: WindowSet, column: str) -> TextTable:
     return TextTable(f"{column}, {windows.name}", ("", *episodes.planners), tuple(rows))
 
 
-def list_verdicts(sets: Sequence[WindowSet], models: Sequence[str]) -> list[str]:
+def list_verdicts(sets: Sequence[WindowSet], models: Sequence[str], ghost: str) -> list[str]:
     """Lines on what holds: whether reaction matters, and the aims for the best of the learned traffic.
 
     Args:
         sets: Random windows first, then conflict windows if there are any.
         models: Names of the learned traffic.
+        ghost: Name of the traffic that does not react.
     """
     lines = []
     for windows in sets:
         episodes = windows.episodes
-        if GHOST in episodes.traffic:
-            ghost = episodes.traffic.index(GHOST)
-            error = np.abs(episodes.values[SCORE][ghost] - episodes.values[SCORE][0])[episodes.is_measured]
-            hits = (episodes.values[HIT][ghost] != episodes.values[HIT][0])[episodes.is_measured]
+        if ghost in episodes.traffic:
+            row = episodes.traffic.index(ghost)
+            error = np.abs(episodes.values[SCORE][row] - episodes.values[SCORE][0])[episodes.is_measured]
+            hits = (episodes.values[HIT][row] != episodes.values[HIT][0])[episodes.is_measured]
             lines.append(
-                f"{windows.name}: reaction moves the score by more than 0.05 in {int((error > 0.05).sum())} of "
+                f"{windows.name}: reaction moves the score by more than {CHANGED} in {int((error > CHANGED).sum())} of "
                 f"{len(error)} episodes, and who is hit in {int(hits.sum())}."
             )
         for label, column in (("score", SCORE), ("hit rate", HIT)):
@@ -220,18 +223,18 @@ def draw_figure(sets: Sequence[WindowSet], shown: Sequence[str]) -> Figure:
     return figure
 
 
-def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> list[str]:
+def write_report(episodes: Episodes, models: Sequence[str], out: Path, *, ghost: str) -> list[str]:
     """Write report.md and figure.png; returns the verdicts.
 
     Args:
         episodes: Episodes of all windows.
         models: Names of the learned traffic.
         out: Folder of the files.
+        ghost: Name of the traffic that does not react.
     """
     sets, values = choose_sets(episodes), episodes.values
     is_seen = values["off_lane_steps"][0] == 0
-    seen = WindowSet("episodes whose ego SUMO always sees", episodes)
-    seen_tables = [seen.measure(SCORE, "episode_error", is_seen), seen.measure(HIT, "episode_error", is_seen)]
+    seen_tables = pool_errors(episodes, is_seen)
     tables = [build_error_table(windows) for windows in sets] + [build_paired_table(windows) for windows in sets]
     tables += [
         build_parts_table(sets[0], "By distance from the log after 8 s", list_distances(episodes)),
@@ -239,11 +242,7 @@ def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> list[s
         TextTable(
             f"Without the {np.mean(~is_seen):.0%} of episodes with steps at which the ego is on no lane of SUMO",
             ("", "score of an episode", "hit rate of an episode"),
-            tuple(
-                (name, *(format_cell(table[:, t]) for table in seen_tables))
-                for t, name in enumerate(episodes.traffic)
-                if t
-            ),
+            list_rows(episodes, lambda t: [format_cell(table[:, t]) for table in seen_tables]),
         ),
         *(build_planner_table(windows, column) for windows in sets for column in (SCORE, HIT, AT_FAULT)),
         TextTable(
@@ -252,12 +251,12 @@ def write_report(episodes: Episodes, models: Sequence[str], out: Path) -> list[s
             tuple((name, f"{np.nanmean(values['seconds'][t]):.2f}") for t, name in enumerate(episodes.traffic)),
         ),
     ]
-    lines = list_verdicts(sets, models)
+    lines = list_verdicts(sets, models, ghost)
     lines.append(
         f"A road user that is no agent of the scenario came within 20 m of the ego in "
         f"{np.mean(values['num_strangers'][0] > 0):.0%} of the episodes in truth."
     )
-    shown = [name for name in (*REFERENCES, "constant velocity", *models) if name in episodes.traffic][:MAX_COLORS]
+    shown = [name for name in (*REFERENCES, "constant velocity", *models) if name in episodes.traffic][: len(COLORS)]
     save_figure(out / "figure.png", draw_figure(sets, shown))
     environment = describe_environment()
     parts = [

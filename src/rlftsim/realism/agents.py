@@ -72,6 +72,11 @@ class SimulatedStates:
         """Number of rollouts, N x repeat."""
         return self.x.shape[0] * self.repeat
 
+    def find_rows(self, object_ids: Int[np.ndarray, "n"]) -> Int64[np.ndarray, "n"]:
+        """Rows of agents that are all among the simulated ones."""
+        order = np.argsort(self.object_id)
+        return order[np.searchsorted(self.object_id[order], object_ids)]
+
     def simulated_path(self, object_id: int) -> Float[Tensor, "N T 2"]:
         """Simulated positions of an agent, m."""
         row = int(np.flatnonzero(self.object_id == object_id)[0])

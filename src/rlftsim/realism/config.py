@@ -114,8 +114,7 @@ class MetricConfig:
     reports_traffic_lights: bool = True
     """True if the official result of that year has traffic light fields."""
     challenge: Challenge = SIM_AGENTS
-    aggregate_objects: bool = False
-    """Count the values of all agents in the same histogram, those of traffic lights excepted."""
+    """One that makes scenes counts the values of all agents in the same histogram, those of traffic lights excepted."""
 
     @property
     def histograms(self) -> tuple[HistogramConfig, ...]:
@@ -155,9 +154,7 @@ METRIC_2025 = MetricConfig(
 """The leaderboard of 2025."""
 
 
-METRIC_2025_SCENARIO_GEN = replace(
-    METRIC_2025, name="2025-scenario-gen", challenge=SCENARIO_GEN, aggregate_objects=True
-)
+METRIC_2025_SCENARIO_GEN = replace(METRIC_2025, name="2025-scenario-gen", challenge=SCENARIO_GEN)
 """The scenario generation leaderboard of 2025."""
 
 # Only two weights differ from 2025: the road edge counts twice as much, traffic lights do not count.

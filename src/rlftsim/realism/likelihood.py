@@ -189,7 +189,7 @@ def count_rollouts(features: Features, log: AnyLog, config: MetricConfig) -> Rol
     bins, num_steps = count_bins(values, table), values.shape[-1]
     outcome, logged = compute_outcomes(features, log), log_target(log, config).outcome
     agreement = (outcome == logged).to(values.dtype)
-    if not config.aggregate_objects:
+    if not config.challenge.makes_scenes:
         return RolloutCounts(bins, agreement, num_steps)
     # Light violations, the last feature, are counted agent by agent all the same.
     num_agents = logged.shape[-1]

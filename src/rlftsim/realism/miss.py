@@ -43,9 +43,7 @@ def compute_miss_rates(scenario: Scenario, states: SimulatedStates) -> MissRates
     goal_step = last + CURRENT_STEP + 1
     speed = np.linalg.norm(tracks.velocity[evaluated, CURRENT_STEP], axis=-1)
     # 2. The same agents in the rollouts, which may list agents in any order.
-    order = np.argsort(states.object_id)
-    rows = order[np.searchsorted(states.object_id[order], tracks.object_id[evaluated])]
-    index = torch.from_numpy(rows).to(states.device)
+    index = torch.from_numpy(states.find_rows(tracks.object_id[evaluated])).to(states.device)
     position = torch.stack([states.x, states.y], -1).index_select(1, index)  # [N, E, T, 2]
     # 3. True where a simulated position is inside the box of the goal.
     goal = torch.from_numpy(tracks.position[evaluated, goal_step, :2]).to(position)

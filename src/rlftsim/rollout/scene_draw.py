@@ -27,7 +27,7 @@ from rlftsim.scenario.types import (
 
 REACH_M = 80.0
 """Agents are drawn this near to the ego, as far as its sensors see."""
-STANDING = 0.5
+STANDING_FRACTION = 0.5
 """Fraction of agents that stand."""
 FASTEST_MPS = {ObjectType.VEHICLE: 13.4, ObjectType.PEDESTRIAN: 1.8, ObjectType.CYCLIST: 6.0}
 SIDE_M = (3.0, 8.0)
@@ -101,7 +101,7 @@ def _draw_history(
     if object_type == ObjectType.VEHICLE and graph.speed_limit_mps[lane] > 0:
         fastest = graph.speed_limit_mps[lane]
     # no farther than from the start of the lane
-    speed = 0.0 if rng.random() < STANDING else min(rng.uniform(0, fastest), end / (CURRENT_STEP * STEP_S))
+    speed = 0.0 if rng.random() < STANDING_FRACTION else min(rng.uniform(0, fastest), end / (CURRENT_STEP * STEP_S))
     at = end - speed * STEP_S * np.arange(CURRENT_STEP, -1, -1)
     x, y, z, heading = (np.interp(at, distance, values) for values in (*line.T, heading))
     if object_type == ObjectType.PEDESTRIAN:

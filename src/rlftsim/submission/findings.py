@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32
 
 from rlftsim.errors import shorten
 from rlftsim.evaluation.rollout_checks import MAX_FIRST_STEP_ERROR_M, PoseChecks
@@ -150,25 +149,22 @@ def check_rollouts(
         for scene, row in np.argwhere(~(np.isfinite(sizes) & (sizes > 0)).all((2, 3)))[:1]:
             text = f"width, length or height is no number above 0 in scene {scene}"
             findings.append(Finding(19, "error", text, file, decoded.scenario_id, decoded.object_ids[scene][row]))
-        findings += _find_history(decoded.object_ids[0], poses, scenario, file)
+        findings += _find_history(checks, scenario, file)
         return ScenarioCheck(tuple(findings), poses.shape[0] * poses.shape[1])
     error = checks.first_step_errors()
     return ScenarioCheck(tuple(findings), error.size, int((error > MAX_FIRST_STEP_ERROR_M).sum()))
 
 
-def _find_history(
-    object_ids: tuple[int, ...], poses: Float32[np.ndarray, "N A 4 T"], scenario: Scenario, file: str
-) -> Iterator[Finding]:
+def _find_history(checks: PoseChecks, scenario: Scenario, file: str) -> Iterator[Finding]:
     """Agents that repeat the history of their log, which the challenge does not let a model read: 20."""
-    tracks = scenario.tracks
-    rows = [int(np.flatnonzero(tracks.object_id == object_id)[0]) for object_id in object_ids]
+    tracks, rows = scenario.tracks, checks.rows
     valid = tracks.valid[rows, :HISTORY_STEPS]  # [A, S]
     logged = np.moveaxis(tracks.position[rows, :HISTORY_STEPS, :2], -1, 1)  # [A, 2, S]
-    gap = np.linalg.norm(poses[:, :, :2, :HISTORY_STEPS] - logged, axis=2)  # [N, A, S]
+    gap = np.linalg.norm(checks.poses[:, :, :2, :HISTORY_STEPS] - logged, axis=2)  # [N, A, S]
     repeats = ((gap <= SAME_M) | ~valid).all(-1).any(0) & (np.array(rows) != scenario.ego_index)  # [A]
     if repeats.any():
         text = f"{repeats.sum()} of {len(rows) - 1} agents repeat their logged history, which must not be read"
-        yield Finding(20, "warning", text, file, scenario.scenario_id, object_ids[int(repeats.argmax())])
+        yield Finding(20, "warning", text, file, scenario.scenario_id, checks.object_ids[int(repeats.argmax())])
 
 
 def _structure(decoded: DecodedRollouts, scenario: Scenario, file: str, challenge: Challenge) -> Iterator[Finding]:

@@ -50,9 +50,9 @@ def true_world(
     chosen = tuple(PLANNERS) if planners == ALL else tuple(name.strip() for name in planners.split(","))
     surroundings = (TRUTH, GHOST, *RULES, *map(shift_truth, shifts), *learned)
     config = TrueWorldConfig(data, surroundings, chosen, seed, limit)
-    count = len(config.list_trips())
-    table = drive_true_world(config, out, work.runner(jobs, work.on_error) or choose_runner(jobs, count))
+    runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(config.trips))
+    table = drive_true_world(config, out, runner)
     episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
-    for line in write_report(episodes, [s.name for s in learned], out):
+    for line in write_report(episodes, [s.name for s in learned], out, ghost=GHOST.name):
         print_line(f"* {line}")
     print_line(out / "report.md")
