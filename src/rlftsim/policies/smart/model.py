@@ -22,6 +22,7 @@ from rlftsim.policies.distributions import (
     LazyTokenDistribution,
     TokenDistribution,
     TokenRows,
+    at_least_float32,
 )
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import ClassHeads
@@ -228,4 +229,5 @@ class SmartModel(nn.Module):
             last_phase = x[:, self.config.dim :]
             hidden = torch.cat([hidden, scores.queries(hidden, last_phase, class_id)], -1)
             weight = torch.cat([weight, scene.token_keys.keys], -1)
+        hidden = at_least_float32(hidden)  # logits may be computed after autocast has ended
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask, self.sampling)
