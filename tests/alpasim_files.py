@@ -37,8 +37,8 @@ def write_alpasim(folder: Path) -> Path:
     weights["encoder.agent_encoder.type_a_emb.weight"] = draw(4, DIM)
     # motions: a box that goes straight on at speeds from zero; pieces: two chords of 4 m that turn
     box = torch.tensor([[2.4, 1.0], [2.4, -1.0], [-2.4, -1.0], [-2.4, 1.0]])
-    way = torch.arange(NUM_TOKENS)[:, None] * torch.arange(6) * 0.1  # [V, 6]
-    motions = box + torch.stack([way, 0 * way], -1)[:, :, None]
+    distance = torch.arange(NUM_TOKENS)[:, None] * torch.arange(6) * 0.1  # [V, 6]
+    motions = box + torch.stack([distance, 0 * distance], -1)[:, :, None]
     turn = torch.linspace(-0.5, 0.5, NUM_PIECES)
     bend = torch.stack([4 + 4 * turn.cos(), 4 * turn.sin()], -1)
     pieces = torch.stack([torch.zeros(NUM_PIECES, 2), torch.tensor([4.0, 0.0]).expand(NUM_PIECES, 2), bend], 1)
