@@ -62,7 +62,8 @@ class SmartModel(nn.Module):
         self.vocabulary = vocabulary
         # numbers of tokens that exist, by class
         class_sizes = tuple(vocabulary.token_mask.sum(1).tolist()) if config.head_per_class else ()
-        self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes)
+        num_map_points = vocabulary.map_prototypes.shape[1]
+        self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes, num_map_points)
 
     def _apply(self, fn, recurse: bool = True):
         """Moves to a device take the vocabulary along."""
