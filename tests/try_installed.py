@@ -13,7 +13,7 @@ from pathlib import Path
 
 SCENARIO = "9d639de83d6f5239"
 COMMANDS = (
-    f"simulate demo-base --data synthetic --scenario {SCENARIO} --out rollouts",
+    f"simulate demo-tuned --data synthetic --scenario {SCENARIO} --out rollouts",
     "score rollouts --scenarios synthetic --explain pages",
 )
 WHERE = """

@@ -319,7 +319,7 @@ class MapUse:
 
 def predicts_tokens(policy: object) -> bool:
     """True for a policy with measurable map use: predictions of the tokens of a vocabulary along logged tracks."""
-    return isinstance(policy, PretrainablePolicy) and isinstance(getattr(policy, "vocabulary", None), Vocabulary)
+    return hasattr(policy, "teacher_forced") and isinstance(getattr(policy, "vocabulary", None), Vocabulary)
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """A calibrated policy is a policy like any other, and with eta 0 it is its base."""
 
 import copy
+import inspect
 import pickle
 
 import pytest
@@ -16,6 +17,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, TokenPolicy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
@@ -51,6 +53,12 @@ def test_a_calibrated_policy_keeps_the_contract(base):
     with_all_neighbors = tiny.tiny_policy(base.vocabulary, tiny.replace(tiny.WITHOUT_CHANCE, **config)).train()
     report = check_policy(CalibratedPolicy(with_all_neighbors, NAMES, ETA), SCENES[:2])
     assert report.is_passed, str(report)
+
+
+def test_every_python_sees_the_members_of_a_policy(calibrated):
+    # as isinstance does from Python 3.12 on: without __getattr__, by which torch finds parameters and we the base's
+    for name in (*TokenPolicy.__annotations__, *Policy.__annotations__):
+        assert inspect.getattr_static(calibrated, name, None) is not None, name
 
 
 def test_with_eta_zero_it_decides_as_its_base_bit_for_bit(base):

@@ -28,6 +28,7 @@ from rlftsim.rollout.policy import TokenPolicy
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import STEP_S
+from rlftsim.tokens.vocabulary import Vocabulary
 
 CHANGES = {
     "rmm": ("RMM", "+.4f"),
@@ -44,8 +45,7 @@ BASE = "base"
 CALIBRATION = "calibration.json"
 """How eta was fitted and what each feature earns."""
 PASSED_ON = (
-    *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced"),
-    *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary", "sampling"),
+    *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced", "sampling"),
 )
 """Attributes that a calibrated policy passes on from the base, if the base has these."""
 
@@ -195,6 +195,28 @@ class CalibratedPolicy(nn.Module):
 
     def __getattr__(self, name: str) -> Any:
         return getattr(super().__getattr__("base"), name) if name in PASSED_ON else super().__getattr__(name)
+
+    # what every `TokenPolicy` has; from Python 3.12 on isinstance sees none of the attributes of `__getattr__`
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """Tokens of the base."""
+        return self.base.vocabulary
+
+    @property
+    def steps_per_decision(self) -> int:
+        """Steps of 0.1 s for which the base decides at once."""
+        return self.base.steps_per_decision
+
+    @property
+    def noise_size(self) -> int:
+        """Uniform numbers that a decision of the base takes."""
+        return self.base.noise_size
+
+    @property
+    def initial_noise_size(self) -> int:
+        """Uniform numbers that the base takes at the beginning."""
+        return self.base.initial_noise_size
 
     def __repr__(self) -> str:
         return f"CalibratedPolicy({self.base!r}, {len(self.features)} features)"
