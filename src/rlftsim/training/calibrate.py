@@ -295,11 +295,11 @@ class CalibrationLearner(Learner):
 
     def _roll_out(
         self, positions: list[int], stage: int | None, fabric: Fabric
-    ) -> tuple[ScenarioBatch, Rollouts, "_Recorder", RealismResult, AgentScores]:
+    ) -> tuple[ScenarioBatch, Rollouts, "Recorder", RealismResult, AgentScores]:
         """Scenarios of a stage, their rollouts with what was recorded, and the scores of these."""
         ids, purpose = (self.fitted_ids, "direction") if stage is None else (self.held_back_ids, "length")
         batch = batch_with_futures(self.scenarios, [ids[position] for position in positions]).to(fabric.device)
-        recorder = _Recorder(needs_score=stage is None)
+        recorder = Recorder(needs_score=stage is None)
         with fabric.autocast():
             rollouts = simulate(
                 self.policy, batch, num_rollouts=self.config.num_rollouts,
@@ -308,7 +308,7 @@ class CalibrationLearner(Learner):
         return batch, rollouts, recorder, *score_rollouts(batch, rollouts, self.config.metric)
 
 
-class _Recorder:
+class Recorder:
     """A `choose` of `simulate` that adds up the score function of the weights, or the KL to the base.
 
     Args:
@@ -324,6 +324,14 @@ class _Recorder:
         self.needs_score = needs_score
 
     def __call__(self, distribution: Any, state: object, sampling: Any, noise: Tensor) -> Tensor:
+        """Decisions [B, N, A], drawn as without a recorder.
+
+        Args:
+            distribution: Distribution of a calibrated policy.
+            state: State before the decision; not read here.
+            sampling: Temperature and truncation of the draw.
+            noise: Uniform numbers of the draw.
+        """
         decision = distribution.sample(sampling, noise)
         if self.needs_score:
             self.score = self.score + distribution.score_function(decision)
