@@ -244,8 +244,8 @@ def _step(
     routeless = episode.atlas.route_length == 0
     step = moved[:, :2] - previous[:, :2]
     forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
-    ends = episode.atlas.route_points[np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)]
-    near_end = np.linalg.norm(moved[:, :2] - ends, axis=-1) <= AT_GOAL_M
+    to_end = moved[:, 0] + 1j * moved[:, 1] - episode.atlas.route_end
+    near_end = np.abs(to_end) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {
         "progress": np.where(routeless, forward, gained) / 10.0,
@@ -321,7 +321,7 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
     scene, agent = episode.world.actors[rows].T
     motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
-    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[scene])
+    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[rows])
     free = distance.min(1) - SIMPLIFIED_M
     unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_alongside).all(1) | episode.world.has_levels[scene])
     free += OUTSIDE_M
@@ -350,9 +350,8 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
     """Distance of each agent along the route, as `Route.progress`, for all at once."""
     atlas, row = episode.atlas, np.arange(len(motion))
-    dx = motion[:, :1] - atlas.route_points[..., 0]  # [M, r]; padding is far away
-    dy = motion[:, 1:2] - atlas.route_points[..., 1]
-    nearest = (dx * dx + dy * dy).argmin(1)
-    heading = atlas.route_heading[row, nearest]
-    forward = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
+    offset = motion[:, :1] + 1j * motion[:, 1:2] - atlas.route_points  # [M, r]; padding is far away
+    nearest = (np.square(offset.real) + np.square(offset.imag)).argmin(1)
+    heading, offset = atlas.route_heading[row, nearest], offset[row, nearest]
+    forward = np.cos(heading) * offset.real + np.sin(heading) * offset.imag
     return np.where(atlas.route_length > 0, SPACING_M * nearest + forward, 0.0)
