@@ -5,6 +5,7 @@ B scenes in step, M planner-driven agents over all scenes. An `Episode` does not
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,25 @@ class Episode:
     def num_agents(self) -> int:
         """M."""
         return len(self.world.actors)
+
+    @cached_property
+    def size(self) -> Float[np.ndarray, "M 2"]:
+        """Length and width of the planner-driven agents, m."""
+        return self.world.size[tuple(self.world.actors.T)]
+
+    @cached_property
+    def object_type(self) -> Int64[np.ndarray, "M"]:
+        """Types of the planner-driven agents."""
+        return self.world.object_type[tuple(self.world.actors.T)]
+
+    @cached_property
+    def reach_m(self) -> Float[np.ndarray, "M A"]:
+        """Distance beyond which boxes cannot overlap, half of both diagonals; negative for an agent itself."""
+        diagonal = np.hypot(self.world.size[..., 0], self.world.size[..., 1])
+        scene, agent = self.world.actors.T
+        reach = (diagonal[scene] + diagonal[scene, agent][:, None]) / 2 + 1e-6
+        reach[np.arange(self.num_agents), agent] = -1.0
+        return reach
 
     def agent_name(self, row: int) -> str:
         """Scenario and object id of a planner-driven agent."""
@@ -146,18 +166,15 @@ def advance(
         ConfigError: no numbers, a NaN, a wrong shape, or an action that an agent cannot take.
     """
     motion = own_motion(episode, state.world)
-    scene, agent = episode.world.actors.T
-    actors = Actors(
-        episode.agent_name, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent]
-    )
+    actors = Actors(episode.agent_name, motion, episode.size, episode.object_type)
     action = validate_actions(action, episode.controls, episode.agent_name, episode.num_agents)
     moves = episode.controls.move(action, actors)
     motions = moves.motion if imposed is None else np.where(np.isnan(imposed), moves.motion, imposed)
     terms = {}
     for step in range(episode.controls.steps):
+        moved = motions[:, step].copy()
         # an agent whose episode is over stands still
-        stands = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], -1)
-        moved = np.where(state.ended[:, None], stands, motions[:, step])
+        moved[state.ended, :3], moved[state.ended, 3:] = motion[state.ended, :3], 0.0
         state, step_terms = _step(episode, state, moved)
         terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
     following = _with_ends(episode, state)
@@ -197,12 +214,13 @@ def _with_dice(episode: Episode, state: EpisodeState, dice: tuple[Dice, ...]) ->
 
 def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
     """True = an event of `stop_on` has happened to the agent."""
-    events = {
-        "collision": np.array([bool(collisions) for collisions in state.collisions], bool),
-        "offroad": state.outside,
-        "goal": state.at_goal,
-    }
-    return np.any([events[name] for name in episode.config.stop_on] or [np.zeros(episode.num_agents, bool)], axis=0)
+    stopped = np.zeros(episode.num_agents, bool)
+    for name in episode.config.stop_on:
+        if name == "collision":
+            stopped |= [bool(collisions) for collisions in state.collisions]
+        else:
+            stopped |= state.outside if name == "offroad" else state.at_goal
+    return stopped
 
 
 def _with_ends(episode: Episode, state: EpisodeState) -> EpisodeState:
@@ -219,21 +237,20 @@ def _step(
     world = step_world(episode.world, state.world, moved)
     # 1. contacts with tracks that have not been touched
     contacts = _contacts(episode, world, moved) & ~state.touched
-    collisions = [list(earlier) for earlier in state.collisions]
+    collisions, (new_collisions, at_fault) = list(state.collisions), np.zeros((2, episode.num_agents))
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
-        scene, ego = episode.world.actors[row]
-        collisions[row].append(
-            classify_collision(
-                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, ego],
-                _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
-            )
+        scene, _ = episode.world.actors[row]
+        collision = classify_collision(
+            episode.world.scenes[scene], world.step, int(agent), moved[row], episode.size[row],
+            _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
         )  # fmt: skip
-    new_collisions = [current[len(earlier) :] for current, earlier in zip(collisions, state.collisions)]
+        collisions[row] = (*collisions[row], collision)
+        new_collisions[row] += 1.0
+        at_fault[row] += collision.at_fault
     # 2. road and route
-    scene, agent = episode.world.actors.T
-    half_diagonal = np.hypot(*episode.world.size[scene, agent].T) / 2
-    turned = np.abs(wrapped(moved[:, 2] - previous[:, 2])) * half_diagonal
-    clear = state.clear_m - np.hypot(*(moved[:, :2] - previous[:, :2]).T) - turned
+    step = moved - previous
+    half_diagonal = np.hypot(episode.size[:, 0], episode.size[:, 1]) / 2
+    clear = state.clear_m - np.hypot(step[:, 0], step[:, 1]) - np.abs(wrapped(step[:, 2])) * half_diagonal
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
         clear[unclear] = _free_way_m(episode, world, unclear)
@@ -242,20 +259,19 @@ def _step(
     progress = _progress(episode, moved)
     gained = progress - state.progress
     routeless = episode.atlas.route_length == 0
-    step = moved[:, :2] - previous[:, :2]
     forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
     to_end = moved[:, 0] + 1j * moved[:, 1] - episode.atlas.route_end
     near_end = np.abs(to_end) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {
         "progress": np.where(routeless, forward, gained) / 10.0,
-        "collision": np.array([float(len(contacts)) for contacts in new_collisions]),
-        "at_fault": np.array([float(sum(collision.at_fault for collision in contacts)) for contacts in new_collisions]),
+        "collision": new_collisions,
+        "at_fault": at_fault,
         "offroad": (outside & ~state.outside).astype(float),
         "goal": (at_goal & ~state.at_goal).astype(float),
     }
     following = EpisodeState(
-        world, state.touched | contacts, tuple(map(tuple, collisions)), outside, at_goal, clear, progress, state.ended
+        world, state.touched | contacts, tuple(collisions), outside, at_goal, clear, progress, state.ended
     )
     return following, terms
 
@@ -332,18 +348,20 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
 
 def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 5"]) -> Bool[np.ndarray, "M A"]:
     """Tracks that each planner-driven agent overlaps now."""
-    scene, agent = episode.world.actors.T
-    size = episode.world.size
-    is_touchable = find_presence(episode.world, world)[1][scene, :, -1]
-    is_touchable[np.arange(len(scene)), agent] = False
-    tracks = world.motion[scene]  # [M, A, 5]
-    gap, agent_size = tracks[..., :2] - motion[:, None, :2], size[scene, agent][:, None]
-    meets = is_touchable & boxes_overlap(gap, motion[:, None, 2], tracks[..., 2], agent_size, size[scene])
+    tracks = world.motion[episode.world.actors[:, 0]]  # [M, A, 5]
+    gap = tracks[..., :2] - motion[:, None, :2]
+    # few boxes are in reach of each other
+    meets = find_presence(episode.world, world)[1][episode.world.actors[:, 0], :, -1]
+    meets &= np.hypot(gap[..., 0], gap[..., 1]) <= episode.reach_m
+    row, other = np.nonzero(meets)
+    scene, agent = episode.world.actors[row].T
+    size = episode.world.size[scene, other]
+    meets[row, other] = boxes_overlap(gap[row, other], motion[row, 2], tracks[row, other, 2], episode.size[row], size)
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
-        rise = z[scene] - z[scene, agent][:, None]
-        is_same_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
-        meets &= is_same_level | ~episode.world.has_levels[scene][:, None]
+        rise = z[scene, other] - z[scene, agent]
+        is_same_level = heights_overlap(rise, height[scene, agent], height[scene, other])
+        meets[row, other] &= is_same_level | ~episode.world.has_levels[scene]
     return meets
 
 

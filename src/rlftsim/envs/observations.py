@@ -368,7 +368,10 @@ def _leave_out_other_levels(
     above_route = ground - atlas.route_ground[np.arange(len(scene)), nearest_on_route]
     # a box as high as the agent's whose height difference is 0 stands on the same ground
     neighbors = RouteHeights.measure(
-        state.motion[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground
+        state.motion[scene][..., :2],
+        z[scene] - half,
+        atlas.route_points[..., None].view(np.float64),
+        atlas.route_ground,
     )
     for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
         difference = heights.differences(np.sqrt(distances[name]), ground, above_route)
