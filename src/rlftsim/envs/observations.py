@@ -33,8 +33,9 @@ HISTORY = 10
 OWN_LANES = 12
 """Nearest pieces that an agent's own lane is searched among."""
 _FAR_M = 1e7
-_INDEX_BITS = (1 << 20) - 1
-_SEEN_KEY = int(np.float64(SEEN_M * SEEN_M).view(np.int64)) | _INDEX_BITS
+_ROW_BITS = (1 << 24) - 1
+_SEEN_KEY = int(np.float64(SEEN_M * SEEN_M).view(np.int64)) | _ROW_BITS
+_COLORS = np.array([RED, YELLOW, GREEN])
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +97,12 @@ class Atlas:
     """Maps and routes around M agents, cut once for each episode. Points are x + iy; padding is far away."""
 
     x: Float[np.ndarray, "M N"]
-    """Middles of all lanes, edges, crossings, lights and route points, side by side."""
+    """Middles of all lanes, edges, crossings, lights and route points, and space for the agents, side by side."""
     y: Float[np.ndarray, "M N"]
+    index: Int64[np.ndarray, "M N"]
+    """Rows of these things in the arrays below, counted over all agents."""
     columns: dict[str, slice]
-    """Columns of "lanes", "edges", "crossings", "lights" and "route" in `x` and `y`."""
+    """Columns of "lanes", "edges", "crossings", "lights", "neighbors" and "route" in `x`, `y` and `index`."""
     points: dict[str, Complex[np.ndarray, "M n p"]]
     """All points of lanes, edges, crossings and lights."""
     lane_direction: Complex[np.ndarray, "M n 10"]
@@ -143,28 +146,33 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         routes: Routes of the M planner-driven agents, in the order of `world.actors`.
     """
     rows, scenes = world.actors[:, 0], world.scenes
-    num_lights = max(len(scene.lights.lane) for scene in scenes)
-    lane_light = _stack([np.where(s.lanes.light < 0, num_lights, s.lanes.light) for s in scenes], num_lights)
-    owner = _stack([scene.lanes.lane for scene in scenes], -1)
-    light_point = padded([s.lights.point for s in scenes], (len(scenes), num_lights + 1, 2), _FAR_M)
+    num_lights = max(LIGHTS, 1 + max(len(scene.lights.lane) for scene in scenes))
+    owner = _stack([scene.lanes.lane for scene in scenes], -1, LANES)
     facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
     lane_facts = np.zeros((len(rows), owner.shape[1], 5), np.float32)
-    lane_facts[..., [0, 1, 4]] = _stack(facts, 0.0)[rows]
+    lane_facts[..., [0, 1, 4]] = _stack(facts, 0.0, LANES)[rows]
     for row, route in enumerate(routes):
         lane_facts[row, :, 3] = np.isin(owner[rows[row]], route.lanes)
-    lane_points = _stack([scene.lanes.points for scene in scenes], _FAR_M)
+    lane_light = [np.where(s.lanes.light < 0, num_lights - 1, s.lanes.light) for s in scenes]
+    lane_light = _stack(lane_light, num_lights - 1, LANES)[rows] + num_lights * np.arange(len(rows))[:, None]
+    lane_points = _stack([scene.lanes.points for scene in scenes], _FAR_M, LANES)
     corners = {
-        "lanes": lane_points,
-        "edges": _stack([scene.edges for scene in scenes], _FAR_M),
-        "crossings": _stack([scene.crossings for scene in scenes], _FAR_M),
-        "lights": light_point,
+        "lanes": lane_points.reshape(*owner.shape, -1),
+        "edges": _stack([scene.edges for scene in scenes], _FAR_M, EDGES),
+        "crossings": _stack([scene.crossings for scene in scenes], _FAR_M, CROSSINGS),
+        "lights": _stack([scene.lights.point for scene in scenes], _FAR_M, num_lights),
     }
-    points = {name: _to_complex(array.reshape(*array.shape[:2], -1))[rows] for name, array in corners.items()}
-    beyond = [np.full((ROUTE, 2), _FAR_M)]  # a route shows as many points at its end as anywhere
-    route_points = _to_complex(_stack([np.concatenate([route.points, *beyond]) for route in routes] or beyond, _FAR_M))
-    route_ground = padded([route.ground for route in routes] or [np.zeros(0)], route_points.shape[:2])
+    points = {name: _to_complex(array)[rows] for name, array in corners.items()}
+    beyond = np.full((ROUTE, 2), _FAR_M)  # a route shows as many points at its end as anywhere
+    route_xy = _stack([np.concatenate([route.points, beyond]) for route in routes], _FAR_M, ROUTE)
+    route_points = _to_complex(route_xy)[..., 0]
+    route_ground = padded([route.ground for route in routes], route_points.shape)
+    space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), _FAR_M + 0j)
     middles = {name: array.mean(-1) for name, array in points.items()}
-    middles |= {"lanes": points["lanes"][..., SEGMENT_POINTS // 2], "route": route_points[..., 0]}
+    middles |= {"lanes": points["lanes"][..., SEGMENT_POINTS // 2], "neighbors": space, "route": route_points}
+    index = {name: np.arange(middle.size).reshape(middle.shape) for name, middle in middles.items()}
+    num_agents = world.mask.shape[1]
+    index["neighbors"] = np.minimum(np.arange(space.shape[1]), num_agents - 1) + num_agents * rows[:, None]
     ends = np.cumsum([0, *(middle.shape[1] for middle in middles.values())])
     heights: dict[str, RouteHeights] = {}
     if world.has_levels.any():
@@ -174,7 +182,6 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
             "crossings": [s.crossings_z for s in scenes],
             "lights": [s.lights.z for s in scenes],
         }
-        route_xy = route_points.view(np.float64)
         for name, z in features.items():
             middle = middles[name]
             padded_z = padded(z, (len(scenes), middle.shape[1]))[rows]
@@ -185,27 +192,28 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     return Atlas(
         x=np.concatenate([middle.real for middle in middles.values()], 1),
         y=np.concatenate([middle.imag for middle in middles.values()], 1),
+        index=np.concatenate(list(index.values()), 1),
         columns={name: slice(*ends[i : i + 2]) for i, name in enumerate(middles)},
         points=points,
         lane_direction=np.exp(1j * compute_headings(lane_points))[rows],
         lane_facts=lane_facts,
-        lane_light=lane_light[rows] + (num_lights + 1) * np.arange(len(rows))[:, None],
-        lights=_stack_lights([scene.lights for scene in scenes], num_lights + 1),
+        lane_light=lane_light,
+        lights=_stack_lights([scene.lights for scene in scenes], num_lights),
         agent_facts=np.concatenate([world.size, world.object_type[..., None]], -1).astype(np.float32),
         log_age_s=np.moveaxis(age, 2, 0).astype(np.float32),
         routes=routes,
-        route_points=route_points[..., 0],
-        route_heading=padded([route.heading for route in routes] or [np.zeros(0)], route_points.shape[:2]),
-        route_limit=padded([route.limit_mps for route in routes] or [np.zeros(0)], route_points.shape[:2]),
+        route_points=route_points,
+        route_heading=padded([route.heading for route in routes], route_points.shape),
+        route_limit=padded([route.limit_mps for route in routes], route_points.shape),
         route_length=np.array([len(route) for route in routes], np.int64),
         route_ground=route_ground,
         heights=heights,
     )
 
 
-def _stack(arrays: list[np.ndarray], fill: float | int) -> np.ndarray:
-    """Arrays of different lengths, padded to the longest, at least to a single row."""
-    longest = max(1, *(len(array) for array in arrays))
+def _stack(arrays: list[np.ndarray], fill: float | int, least: int) -> np.ndarray:
+    """Arrays of different lengths, padded to the longest, at least to so many rows."""
+    longest = max(least, *(len(array) for array in arrays))
     return padded(arrays, (len(arrays), longest, *arrays[0].shape[1:]), fill)
 
 
@@ -235,114 +243,102 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     """
     scene, agent = world.actors.T
     row, count, log_step = np.arange(len(scene)), len(scene), len(state.track) - 1
-    past = np.stack(state.track[-HISTORY - 1 :])  # [11, B, A, 5]
-    motion, others = past[-1, scene, agent], past[-1, scene]  # [M, 5], [M, A, 5]
-    position, angle = _to_complex(motion[:, :2]), motion[:, 2:3]  # [M, 1]
-    if frame == "ego":
-        origin, rotation = position, np.cos(angle) - 1j * np.sin(angle)
-    else:
-        origin, rotation, angle = np.zeros_like(position), np.ones_like(position), np.zeros_like(angle)
+    past = np.array(state.track[-HISTORY - 1 :])  # [11, B, A, 5]
+    others = past[-1].take(scene, axis=0)  # [M, A, 5]
+    motion = others[row, agent]  # [M, 5]
+    position, forward = _to_complex(motion[:, :2]), np.cos(motion[:, 2:3]) + 1j * np.sin(motion[:, 2:3])  # [M, 1]
+    rotation = forward.conj() if frame == "ego" else np.ones_like(forward)
 
-    # 1. Squared distances, infinite where there is nothing to see; each agent comes before its neighbors.
+    def to_frame(offset: Complex[np.ndarray, "*m"]) -> Complex[np.ndarray, "*m"]:
+        return offset * rotation if frame == "ego" else offset + position
+
+    is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
+
+    # 1. Squared distances, infinite where there is nothing to see.
     squared = np.square(atlas.x - motion[:, :1]) + np.square(atlas.y - motion[:, 1:2])  # [M, N]
     distances = {name: squared[:, columns] for name, columns in atlas.columns.items()}
     nearest_on_route = distances.pop("route").argmin(1)
+    to_others = distances["neighbors"][:, : others.shape[1]]
+    to_others[...] = np.square(others[..., 0] - motion[:, :1]) + np.square(others[..., 1] - motion[:, 1:2])
+    to_others[~is_present[..., -1].take(scene, axis=0)] = np.inf
     lights = atlas.lights
     if state.sumo_states:
         lights = _stack_lights(find_lights(world, state), lights[0].shape[2])
-    color, light_age = (values[log_step][scene] for values in lights)  # [M, T + 1]
+    color, light_age = lights[0][log_step].take(scene, axis=0), lights[1][log_step].take(scene, axis=0)  # [M, T1]
     distances["lights"][color == 0] = np.inf
-    is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
-    to_others = np.square(others[..., 0] - motion[:, :1]) + np.square(others[..., 1] - motion[:, 1:2])
-    to_others[~is_present[scene, :, -1]] = np.inf
     if atlas.heights:
         _leave_out_other_levels(world, atlas, state, nearest_on_route, {**distances, "neighbors": to_others})
-    to_others[row, agent] = -1.0
-    # 2. The agent itself and its neighbors over the last 11 steps, the route from the nearest place on.
-    who, is_seen = _nearest(to_others, NEIGHBORS + 1)
-    num_neighbors = who.shape[1] - 1
-    who += others.shape[1] * scene[:, None]
-    moved = past.reshape(HISTORY + 1, -1, 5).take(who, axis=1)  # [11, M, 1 + K, 5]
-    poses = np.empty((*moved.shape[:3], 4), np.float32)
-    _view_points(poses, 1)[...] = (_view_points(moved, 1) - origin[..., None]) * rotation[..., None]
-    direction = (moved[..., 2] - angle).astype(np.float32)
-    poses[..., 2], poses[..., 3] = np.cos(direction), np.sin(direction)
-    poses = np.moveaxis(poses, 0, 2)  # [M, 1 + K, 11, 4]
-    poses[~is_present.reshape(-1, HISTORY + 1).take(who, axis=0)] = 0.0
-    neighbors = np.zeros((count, *SHAPES["neighbors"]), np.float32)
-    shown, who = neighbors[:, :num_neighbors], who[:, 1:]
-    shown[..., :4] = poses[:, 1:, -1]
-    _view_points(shown[..., 4:], 1)[...] = _view_points(moved[-1, :, 1:, 3:], 1) * rotation[..., None]
-    shown[..., 6:9] = atlas.agent_facts.reshape(-1, 3).take(who, axis=0)
-    shown[..., 9] = atlas.log_age_s[log_step].take(who)
-    histories = np.zeros((count, NEIGHBORS, HISTORY, 4), np.float32)
-    histories[:, :num_neighbors] = poses[:, 1:, :-1]
-    ego_speed = signed_speed(moved[:, :, 0])  # [11, M]
-    ego_history = np.concatenate([poses[:, 0], ego_speed.T[..., None]], -1, dtype=np.float32)
-    ego_history[~is_present[scene, agent]] = 0.0
-    index = nearest_on_route[:, None] + np.arange(ROUTE)
-    on_route = index < atlas.route_length[:, None]
-    index += atlas.route_points.shape[1] * row[:, None]
-    route = np.zeros((count, *SHAPES["route"]), np.float32)
-    _view_points(route, 1)[..., 0] = (atlas.route_points.take(index) - origin) * rotation
-    route[..., 2] = atlas.route_limit.take(index)
-    goal = np.ones((count, 3), np.float32)
-    _view_points(goal, 1)[...] = (atlas.route_end[:, None] - origin) * rotation
-    goal[atlas.route_length == 0] = 0.0
-    # 3. The nearest rows of the map.
-    arrays = {"neighbors": neighbors, "neighbors_history": histories, "route": route}
-    masks = {"neighbors": is_seen[:, 1:], "neighbors_history": is_seen[:, 1:], "route": on_route}
-    rows: dict[str, np.ndarray] = {}
+    to_others[row, agent] = -1.0  # each agent comes before its neighbors
+    # 2. The nearest rows in order. The bits of a positive number sort as the number does; the lowest ones, which tell
+    # fractions of a micrometer apart, give way to the row, as numbers are sorted faster than rows by numbers.
+    keys = squared.view(np.int64)
+    keys &= ~_ROW_BITS
+    keys |= atlas.index
+    rows, is_hidden = {}, {}
+    for name in distances:
+        nearest, num_shown = keys[:, atlas.columns[name]], SHAPES[name][0] + (name == "neighbors")
+        if nearest.shape[1] > num_shown:
+            nearest.partition(num_shown - 1, axis=1)
+        nearest = nearest[:, :num_shown]
+        nearest.sort(axis=1)
+        rows[name], is_hidden[name] = nearest & _ROW_BITS, nearest > _SEEN_KEY
+    # 3. The map in the frame of the agents.
+    arrays = {name: np.empty((count, *SHAPES[name]), np.float32) for name in ("ego", "route", "goal", *distances)}
     for name, points in atlas.points.items():
-        nearest, masks[name] = _nearest(distances[name], SHAPES[name][0])  # [M, k]
-        rows[name] = nearest + points.shape[1] * row[:, None]
-        local = points.reshape(-1, points.shape[2]).take(rows[name], axis=0)  # [M, k, p]
+        size = points.shape[2]
+        offset = points.reshape(-1, size).take(rows[name], axis=0).reshape(count, -1) - position  # [M, k p]
         if name == "lanes":
-            beside_lane = _compare_with_lane(atlas, motion, local[:, :OWN_LANES], rows[name], masks[name])
-        local -= origin[..., None]
-        local *= rotation[..., None]
-        arrays[name] = np.zeros((count, *SHAPES[name]), np.float32)
-        _view_points(arrays[name], points.shape[2])[:, : nearest.shape[1]] = local
-    lanes = arrays["lanes"][:, : rows["lanes"].shape[1], 2 * SEGMENT_POINTS :]
+            first = slice(OWN_LANES)
+            beside_lane = _compare_with_lane(atlas, forward, offset, rows[name][:, first], is_hidden[name][:, first])
+        _view_points(arrays[name], size)[...] = to_frame(offset).reshape(count, -1, size)
+    lanes, lamps = arrays["lanes"][..., 2 * SEGMENT_POINTS :], arrays["lights"][..., 2:]
     lanes[...] = atlas.lane_facts.reshape(-1, 5).take(rows["lanes"], axis=0)
     lanes[..., 2] = color.take(atlas.lane_light.take(rows["lanes"]))
-    lamps = arrays["lights"][:, : rows["lights"].shape[1], 2:]
-    lamps[..., :3] = color.take(rows["lights"])[..., None] == (RED, YELLOW, GREEN)
+    lamps[..., :3] = color.take(rows["lights"])[..., None] == _COLORS
     lamps[..., 3] = light_age.take(rows["lights"])
-    for name, mask in masks.items():
-        arrays[name][:, : mask.shape[1]][~mask] = 0.0
+    # 4. The route from the nearest place on, and its end.
+    index = nearest_on_route[:, None] + np.arange(ROUTE)
+    is_hidden["route"] = index >= atlas.route_length[:, None]
+    index += atlas.route_points.shape[1] * row[:, None]
+    _view_points(arrays["route"], 1)[..., 0] = to_frame(atlas.route_points.take(index) - position)
+    arrays["route"][..., 2] = atlas.route_limit.take(index)
+    _view_points(arrays["goal"], 1)[...] = to_frame(atlas.route_end[:, None] - position)
+    arrays["goal"][:, 2] = 1.0
+    is_hidden["goal"] = atlas.route_length == 0
+    # 5. The agent itself and its neighbors over the last 11 steps.
+    who, is_other_hidden = rows["neighbors"], is_hidden["neighbors"]
+    moved = past.reshape(HISTORY + 1, -1, 5).take(who, axis=1)  # [11, M, 1 + K, 5]
+    poses = np.empty((*moved.shape[:3], 4), np.float32)
+    _view_points(poses, 1)[..., 0] = to_frame(_view_points(moved, 1)[..., 0] - position)
+    direction = moved[..., 2] - motion[:, 2:3] if frame == "ego" else moved[..., 2]
+    poses[..., 2], poses[..., 3] = np.cos(direction, dtype=np.float32), np.sin(direction, dtype=np.float32)
+    poses = poses.transpose(1, 2, 0, 3)  # [M, 1 + K, 11, 4]
+    is_absent = ~is_present.reshape(-1, HISTORY + 1).take(who, axis=0)
+    is_absent |= is_other_hidden[..., None]
+    poses[is_absent] = 0.0
+    neighbors, is_hidden["neighbors"] = arrays["neighbors"], is_other_hidden[:, 1:]
+    neighbors[..., :4] = poses[:, 1:, -1]
+    _view_points(neighbors[..., 4:], 1)[..., 0] = _view_points(moved[-1, :, 1:, 3:], 1)[..., 0] * rotation
+    neighbors[..., 6:9] = atlas.agent_facts.reshape(-1, 3).take(who[:, 1:], axis=0)
+    neighbors[..., 9] = atlas.log_age_s[log_step].take(who[:, 1:])
+    # 6. The agent's own numbers.
+    speed = signed_speed(moved[:, :, 0])  # [11, M]
+    ego_history = np.empty((count, *SHAPES["ego_history"]), np.float32)
+    ego_history[..., :4], ego_history[..., 4] = poses[:, 0], speed.T
+    ego_history[..., 4][is_absent[:, 0]] = 0.0
+    yaw_rate = wrapped(motion[:, 2] - moved[-2, :, 0, 2]) / STEP_S
+    ego, facts, length = arrays["ego"], atlas.agent_facts[scene, agent], world.size[scene, agent, 0]
+    is_moving = np.abs(speed[-1]) > 0.1
+    turn = WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(is_moving, speed[-1], 1.0)
+    ego[:, 0], ego[:, 1], ego[:, 2] = speed[-1], (speed[-1] - speed[-2]) / STEP_S, yaw_rate
+    ego[:, 3], ego[:, 4:6], ego[:, 6:10] = np.where(is_moving, np.arctan(turn), 0.0), facts[:, :2], beside_lane
+    ego[:, 10], ego[:, 11] = STEP_S * (steps - state.step), facts[:, 2]
 
-    yaw_rate = wrapped(motion[:, 2] - past[-2, scene, agent, 2]) / STEP_S
-    speed, facts = ego_speed[-1], atlas.agent_facts[scene, agent]
-    length = world.size[scene, agent, 0]
-    moving = np.abs(speed) > 0.1
-    steering = np.where(moving, np.arctan(WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(moving, speed, 1.0)), 0.0)
-    ego = np.empty((count, *SHAPES["ego"]), np.float32)
-    ego[:, 0], ego[:, 1], ego[:, 2], ego[:, 3] = speed, (speed - ego_speed[-2]) / STEP_S, yaw_rate, steering
-    ego[:, 4:6], ego[:, 6:10], ego[:, 10], ego[:, 11] = (
-        facts[:, :2],
-        beside_lane,
-        STEP_S * (steps - state.step),
-        facts[:, 2],
-    )
-    return Observation(
-        ego=ego,
-        ego_history=ego_history,
-        neighbors=neighbors,
-        neighbors_mask=_pad_mask(masks["neighbors"], NEIGHBORS),
-        neighbors_history=histories.reshape(count, NEIGHBORS, -1),
-        lanes=arrays["lanes"],
-        lanes_mask=_pad_mask(masks["lanes"], LANES),
-        edges=arrays["edges"],
-        edges_mask=_pad_mask(masks["edges"], EDGES),
-        crossings=arrays["crossings"],
-        crossings_mask=_pad_mask(masks["crossings"], CROSSINGS),
-        lights=arrays["lights"],
-        lights_mask=_pad_mask(masks["lights"], LIGHTS),
-        route=route,
-        route_mask=_pad_mask(on_route, ROUTE),
-        goal=goal,
-    )
+    for name, is_nothing in is_hidden.items():
+        arrays[name][is_nothing] = 0.0
+    masks = {f"{name}_mask": (~is_hidden[name]).view(np.int8) for name in ("route", *distances)}
+    histories = poses[:, 1:, :-1].reshape(count, NEIGHBORS, -1)
+    return Observation(**arrays, **masks, ego_history=ego_history, neighbors_history=histories)
 
 
 def _leave_out_other_levels(
@@ -387,53 +383,30 @@ def _view_points(array: np.ndarray, count: int) -> np.ndarray:
     return array[..., : 2 * count].view(np.complex64 if array.dtype == np.float32 else np.complex128)
 
 
-def _pad_mask(mask: Bool[np.ndarray, "M n"], length: int) -> Int8[np.ndarray, "M length"]:
-    """Masks with zeros appended."""
-    out = np.zeros((len(mask), length), np.int8)
-    out[:, : mask.shape[1]] = mask
-    return out
-
-
-def _nearest(squared: Float[np.ndarray, "M n"], count: int) -> tuple[Int64[np.ndarray, "M k"], Bool[np.ndarray, "M k"]]:
-    """Indices of the nearest `count` columns of each row in order, and True up to a distance of 100 m.
-
-    The bits of a positive number sort as the number does. The lowest bits, which tell fractions of a micrometer apart,
-    give way to the index: numbers are sorted faster than indices.
-    """
-    key = squared.view(np.int64) & ~_INDEX_BITS | np.arange(squared.shape[1])
-    if key.shape[1] > count:
-        key = np.partition(key, count - 1, axis=1)[:, :count]
-    key.sort(axis=1)
-    return key & _INDEX_BITS, key <= _SEEN_KEY
-
-
 def _compare_with_lane(
     atlas: Atlas,
-    motion: Float[np.ndarray, "M 5"],
-    points: Complex[np.ndarray, "M L 10"],
-    lanes: Int64[np.ndarray, "M l"],
-    has_lane: Bool[np.ndarray, "M l"],
+    forward: Complex[np.ndarray, "M 1"],
+    offset: Complex[np.ndarray, "M n"],
+    lanes: Int64[np.ndarray, "M L"],
+    is_hidden: Bool[np.ndarray, "M L"],
 ) -> Float[np.ndarray, "M 4"]:
     """Cosine and sine of the heading to the lane, lateral offset to it, speed limit; zeros away from lanes.
 
     Args:
         atlas: Maps and routes of the world.
-        motion: Present motion of the agents.
-        points: Points of the nearest L pieces of lanes, map frame, m.
-        lanes: Rows of these pieces in the atlas, and of farther ones.
-        has_lane: False = no piece of a lane.
+        forward: Unit vectors along the agents.
+        offset: Offsets from the agents to the points of the nearest pieces of lanes, L of them or more, m.
+        lanes: Rows of the L nearest pieces in the atlas.
+        is_hidden: True = too far away.
     """
-    row, length = np.arange(len(points)), points.shape[1]
-    lanes = lanes[:, :length]
-    heading = np.cos(motion[:, 2]) + 1j * np.sin(motion[:, 2])
     direction = atlas.lane_direction.reshape(-1, SEGMENT_POINTS).take(lanes, axis=0)
-    offset, turned = _to_complex(motion[:, None, :2]) - points, heading[:, None, None] * direction.conj()
+    turn = forward[..., None] * direction.conj()
     # the point that is nearest among those of lanes that run the agent's way
-    is_same_direction = (turned.real > 0) & has_lane[:, :length, None]
-    squared = np.where(is_same_direction, np.square(offset.real) + np.square(offset.imag), np.inf)
-    best = squared.reshape(len(points), -1).argmin(1)
-    best = row, best // SEGMENT_POINTS, best % SEGMENT_POINTS
-    lateral = (offset[best] * direction[best].conj()).imag
+    offset = offset[:, : turn[0].size].reshape(turn.shape)
+    squared = np.square(offset.real) + np.square(offset.imag)
+    squared[(turn.real <= 0) | is_hidden[..., None]] = np.inf
+    best = squared.reshape(len(lanes), -1).argmin(1)
+    best = np.arange(len(lanes)), best // SEGMENT_POINTS, best % SEGMENT_POINTS
     limit = atlas.lane_facts.reshape(-1, 5)[lanes[best[:2]], 1]
-    values = np.stack([turned[best].real, turned[best].imag, lateral, limit], -1)
-    return np.where(np.isfinite(squared[best])[:, None], values, 0.0)
+    values = np.array([turn[best].real, turn[best].imag, -(offset[best] * direction[best].conj()).imag, limit])
+    return np.where(np.isfinite(squared[best]), values, 0.0).T
