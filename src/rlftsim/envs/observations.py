@@ -107,8 +107,8 @@ class Atlas:
     """All points of lanes, edges, crossings and lights."""
     lane_direction: Complex[np.ndarray, "M n 10"]
     """Unit vectors along the lanes."""
-    lane_facts: Float32[np.ndarray, "M n 5"]
-    """Class, speed limit, space for the light, on the route, stop sign."""
+    lane_rows: Float32[np.ndarray, "M n 25"]
+    """Space for points, class, speed limit, space for the light, on the route, stop sign."""
     lane_light: Int64[np.ndarray, "M n"]
     """Index of the light among those of all agents; an agent's last one is none."""
     lights: tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]
@@ -149,10 +149,10 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     num_lights = max(LIGHTS, 1 + max(len(scene.lights.lane) for scene in scenes))
     owner = _stack([scene.lanes.lane for scene in scenes], -1, LANES)
     facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
-    lane_facts = np.zeros((len(rows), owner.shape[1], 5), np.float32)
-    lane_facts[..., [0, 1, 4]] = _stack(facts, 0.0, LANES)[rows]
+    lane_rows = np.zeros((*owner[rows].shape, SHAPES["lanes"][1]), np.float32)
+    lane_rows[..., [-5, -4, -1]] = _stack(facts, 0.0, LANES)[rows]
     for row, route in enumerate(routes):
-        lane_facts[row, :, 3] = np.isin(owner[rows[row]], route.lanes)
+        lane_rows[row, :, -2] = np.isin(owner[rows[row]], route.lanes)
     lane_light = [np.where(s.lanes.light < 0, num_lights - 1, s.lanes.light) for s in scenes]
     lane_light = _stack(lane_light, num_lights - 1, LANES)[rows] + num_lights * np.arange(len(rows))[:, None]
     lane_points = _stack([scene.lanes.points for scene in scenes], _FAR_M, LANES)
@@ -196,7 +196,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         columns={name: slice(*ends[i : i + 2]) for i, name in enumerate(middles)},
         points=points,
         lane_direction=np.exp(1j * compute_headings(lane_points))[rows],
-        lane_facts=lane_facts,
+        lane_rows=lane_rows,
         lane_light=lane_light,
         lights=_stack_lights([scene.lights for scene in scenes], num_lights),
         agent_facts=np.concatenate([world.size, world.object_type[..., None]], -1).astype(np.float32),
@@ -255,11 +255,11 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
 
     # 1. Squared distances, infinite where there is nothing to see.
-    squared = np.square(atlas.x - motion[:, :1]) + np.square(atlas.y - motion[:, 1:2])  # [M, N]
+    squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]
     distances = {name: squared[:, columns] for name, columns in atlas.columns.items()}
     nearest_on_route = distances.pop("route").argmin(1)
     to_others = distances["neighbors"][:, : others.shape[1]]
-    to_others[...] = np.square(others[..., 0] - motion[:, :1]) + np.square(others[..., 1] - motion[:, 1:2])
+    to_others[...] = _measure_square(others[..., 0] - motion[:, :1], others[..., 1] - motion[:, 1:2])
     to_others[~is_present[..., -1].take(scene, axis=0)] = np.inf
     lights = atlas.lights
     if state.sumo_states:
@@ -284,16 +284,17 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         rows[name], is_hidden[name] = nearest & _ROW_BITS, nearest > _SEEN_KEY
     # 3. The map in the frame of the agents.
     arrays = {name: np.empty((count, *SHAPES[name]), np.float32) for name in ("ego", "route", "goal", *distances)}
+    arrays["lanes"] = atlas.lane_rows.reshape(-1, atlas.lane_rows.shape[2]).take(rows["lanes"], axis=0)
+    arrays["lanes"][..., -3] = color.take(atlas.lane_light.take(rows["lanes"]))
     for name, points in atlas.points.items():
         size = points.shape[2]
-        offset = points.reshape(-1, size).take(rows[name], axis=0).reshape(count, -1) - position  # [M, k p]
+        offset = points.reshape(-1, size).take(rows[name], axis=0).reshape(count, -1)  # [M, k p]
+        offset -= position
         if name == "lanes":
             first = slice(OWN_LANES)
             beside_lane = _compare_with_lane(atlas, forward, offset, rows[name][:, first], is_hidden[name][:, first])
         _view_points(arrays[name], size)[...] = to_frame(offset).reshape(count, -1, size)
-    lanes, lamps = arrays["lanes"][..., 2 * SEGMENT_POINTS :], arrays["lights"][..., 2:]
-    lanes[...] = atlas.lane_facts.reshape(-1, 5).take(rows["lanes"], axis=0)
-    lanes[..., 2] = color.take(atlas.lane_light.take(rows["lanes"]))
+    lamps = arrays["lights"][..., 2:]
     lamps[..., :3] = color.take(rows["lights"])[..., None] == _COLORS
     lamps[..., 3] = light_age.take(rows["lights"])
     # 4. The route from the nearest place on, and its end.
@@ -305,27 +306,30 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     _view_points(arrays["goal"], 1)[...] = to_frame(atlas.route_end[:, None] - position)
     arrays["goal"][:, 2] = 1.0
     is_hidden["goal"] = atlas.route_length == 0
-    # 5. The agent itself and its neighbors over the last 11 steps.
-    who, is_other_hidden = rows["neighbors"], is_hidden["neighbors"]
+    # 5. The agent itself and its neighbors, now and at the ten steps before.
+    who, neighbors = rows["neighbors"], arrays["neighbors"]
     moved = past.reshape(HISTORY + 1, -1, 5).take(who, axis=1)  # [11, M, 1 + K, 5]
-    poses = np.empty((*moved.shape[:3], 4), np.float32)
-    _view_points(poses, 1)[..., 0] = to_frame(_view_points(moved, 1)[..., 0] - position)
-    direction = moved[..., 2] - motion[:, 2:3] if frame == "ego" else moved[..., 2]
-    poses[..., 2], poses[..., 3] = np.cos(direction, dtype=np.float32), np.sin(direction, dtype=np.float32)
-    poses = poses.transpose(1, 2, 0, 3)  # [M, 1 + K, 11, 4]
-    is_absent = ~is_present.reshape(-1, HISTORY + 1).take(who, axis=0)
-    is_absent |= is_other_hidden[..., None]
-    poses[is_absent] = 0.0
-    neighbors, is_hidden["neighbors"] = arrays["neighbors"], is_other_hidden[:, 1:]
-    neighbors[..., :4] = poses[:, 1:, -1]
+    offset = to_frame(_view_points(moved, 1)[..., 0] - position)
+    direction = moved[..., 2] - (motion[:, 2:3] if frame == "ego" else 0.0)
+    history = np.empty((*who.shape, HISTORY, 4), np.float32)  # [M, 1 + K, 10, 4]
+    _view_points(history, 1)[..., 0] = offset[:-1].transpose(1, 2, 0)
+    before = direction[:-1].transpose(1, 2, 0).astype(np.float32)
+    history[..., 2], history[..., 3] = np.cos(before), np.sin(before)
+    is_absent = ~is_present.reshape(-1, HISTORY + 1).take(who, axis=0)  # [M, 1 + K, 11]
+    is_absent |= is_hidden["neighbors"][..., None]
+    history.view(np.complex128)[is_absent[..., :-1]] = 0.0  # four numbers at once
+    is_hidden["neighbors"] = is_hidden["neighbors"][:, 1:]
+    _view_points(neighbors, 1)[..., 0] = offset[-1, :, 1:]
+    neighbors[..., 2], neighbors[..., 3] = np.cos(direction[-1, :, 1:]), np.sin(direction[-1, :, 1:])
     _view_points(neighbors[..., 4:], 1)[..., 0] = _view_points(moved[-1, :, 1:, 3:], 1)[..., 0] * rotation
     neighbors[..., 6:9] = atlas.agent_facts.reshape(-1, 3).take(who[:, 1:], axis=0)
     neighbors[..., 9] = atlas.log_age_s[log_step].take(who[:, 1:])
     # 6. The agent's own numbers.
     speed = signed_speed(moved[:, :, 0])  # [11, M]
     ego_history = np.empty((count, *SHAPES["ego_history"]), np.float32)
-    ego_history[..., :4], ego_history[..., 4] = poses[:, 0], speed.T
-    ego_history[..., 4][is_absent[:, 0]] = 0.0
+    _view_points(ego_history, 1)[..., 0], ego_history[..., 4] = offset[..., 0].T, speed.T
+    ego_history[..., 2], ego_history[..., 3] = np.cos(direction[..., 0].T), np.sin(direction[..., 0].T)
+    ego_history[is_absent[:, 0]] = 0.0
     yaw_rate = wrapped(motion[:, 2] - moved[-2, :, 0, 2]) / STEP_S
     ego, facts, length = arrays["ego"], atlas.agent_facts[scene, agent], world.size[scene, agent, 0]
     is_moving = np.abs(speed[-1]) > 0.1
@@ -337,8 +341,16 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     for name, is_nothing in is_hidden.items():
         arrays[name][is_nothing] = 0.0
     masks = {f"{name}_mask": (~is_hidden[name]).view(np.int8) for name in ("route", *distances)}
-    histories = poses[:, 1:, :-1].reshape(count, NEIGHBORS, -1)
-    return Observation(**arrays, **masks, ego_history=ego_history, neighbors_history=histories)
+    history = history[:, 1:].reshape(count, NEIGHBORS, -1)
+    return Observation(**arrays, **masks, ego_history=ego_history, neighbors_history=history)
+
+
+def _measure_square(x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
+    """Squared lengths of vectors, which take the place of `x`; `y` is changed, too."""
+    x *= x
+    y *= y
+    x += y
+    return x
 
 
 def _leave_out_other_levels(
@@ -399,14 +411,15 @@ def _compare_with_lane(
         lanes: Rows of the L nearest pieces in the atlas.
         is_hidden: True = too far away.
     """
-    direction = atlas.lane_direction.reshape(-1, SEGMENT_POINTS).take(lanes, axis=0)
-    turn = forward[..., None] * direction.conj()
+    turn = atlas.lane_direction.reshape(-1, SEGMENT_POINTS).take(lanes, axis=0).reshape(len(lanes), -1)
+    offset = offset[:, : turn.shape[1]]
     # the point that is nearest among those of lanes that run the agent's way
-    offset = offset[:, : turn[0].size].reshape(turn.shape)
-    squared = np.square(offset.real) + np.square(offset.imag)
-    squared[(turn.real <= 0) | is_hidden[..., None]] = np.inf
-    best = squared.reshape(len(lanes), -1).argmin(1)
-    best = np.arange(len(lanes)), best // SEGMENT_POINTS, best % SEGMENT_POINTS
-    limit = atlas.lane_facts.reshape(-1, 5)[lanes[best[:2]], 1]
-    values = np.array([turn[best].real, turn[best].imag, -(offset[best] * direction[best].conj()).imag, limit])
+    along = turn.real * forward.real + turn.imag * forward.imag
+    squared = np.where(along > 0, _measure_square(offset.real.copy(), offset.imag.copy()), np.inf)
+    squared.reshape(*lanes.shape, -1)[is_hidden] = np.inf
+    best = np.arange(len(lanes)), squared.argmin(1)
+    direction = turn[best].conj()
+    turn, lateral = forward[:, 0] * direction, -(offset[best] * direction).imag
+    limit = atlas.lane_rows.reshape(-1, atlas.lane_rows.shape[2])[lanes[best[0], best[1] // SEGMENT_POINTS], -4]
+    values = np.array([turn.real, turn.imag, lateral, limit])
     return np.where(np.isfinite(squared[best]), values, 0.0).T
