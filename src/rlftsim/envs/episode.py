@@ -69,6 +69,11 @@ class Episode:
         reach[np.arange(self.num_agents), agent] = -1.0
         return reach
 
+    @cached_property
+    def last_light_step(self) -> Int64[np.ndarray, "M"]:
+        """Last step with an observed light around each agent; -1 = there is none."""
+        return np.array([self.world.scenes[scene].lights.last_observed for scene, _ in self.world.actors], np.int64)
+
     def agent_name(self, row: int) -> str:
         """Scenario and object id of a planner-driven agent."""
         scene, agent = self.world.actors[row]
@@ -177,9 +182,9 @@ def advance(
         moved[state.ended, :3], moved[state.ended, 3:] = motion[state.ended, :3], 0.0
         state, step_terms = _step(episode, state, moved)
         terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
-    following = _with_ends(episode, state)
+    following, stopped = _with_ends(episode, state)
     ends = following.ended & ~state.ended
-    terminated = ends & _stopped(episode, state)
+    terminated = ends & stopped
     reward = sum((term.weight * terms[term.name] for term in episode.terms), np.zeros(episode.num_agents))
     reward, truncated = np.where(state.ended, 0.0, reward), ends & ~terminated
     return following, Outcome(reward, terms, terminated, truncated, moves.is_clipped)
@@ -202,7 +207,7 @@ def repeat(
             state = _with_dice(episode, state, dice[step // policy.steps_per_decision])
         state, _ = _step(episode, state, moved)
         if (step + 1) % episode.controls.steps == 0:
-            state = _with_ends(episode, state)
+            state, _ = _with_ends(episode, state)
     return _with_dice(episode, state, dice[-1])
 
 
@@ -223,10 +228,10 @@ def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
     return stopped
 
 
-def _with_ends(episode: Episode, state: EpisodeState) -> EpisodeState:
-    """The same state, with marks for the agents whose episode ends here."""
-    is_over = state.world.step >= episode.config.max_steps
-    return replace(state, ended=state.ended | _stopped(episode, state) | is_over)
+def _with_ends(episode: Episode, state: EpisodeState) -> tuple[EpisodeState, Bool[np.ndarray, "M"]]:
+    """The same state, with marks for the agents whose episode ends here, and True for those that an event stops."""
+    is_over, stopped = state.world.step >= episode.config.max_steps, _stopped(episode, state)
+    return replace(state, ended=state.ended | stopped | is_over), stopped
 
 
 def _step(
@@ -260,8 +265,7 @@ def _step(
     gained = progress - state.progress
     routeless = episode.atlas.route_length == 0
     forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
-    to_end = moved[:, 0] + 1j * moved[:, 1] - episode.atlas.route_end
-    near_end = np.abs(to_end) <= AT_GOAL_M
+    near_end = np.abs(moved[:, 0] + 1j * moved[:, 1] - episode.atlas.route_end) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {
         "progress": np.where(routeless, forward, gained) / 10.0,
@@ -354,6 +358,8 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     meets = find_presence(episode.world, world)[1][episode.world.actors[:, 0], :, -1]
     meets &= np.hypot(gap[..., 0], gap[..., 1]) <= episode.reach_m
     row, other = np.nonzero(meets)
+    if not len(row):
+        return meets
     scene, agent = episode.world.actors[row].T
     size = episode.world.size[scene, other]
     meets[row, other] = boxes_overlap(gap[row, other], motion[row, 2], tracks[row, other, 2], episode.size[row], size)
@@ -368,8 +374,9 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
     """Distance of each agent along the route, as `Route.progress`, for all at once."""
     atlas, row = episode.atlas, np.arange(len(motion))
-    offset = motion[:, :1] + 1j * motion[:, 1:2] - atlas.route_points  # [M, r]; padding is far away
-    nearest = (np.square(offset.real) + np.square(offset.imag)).argmin(1)
-    heading, offset = atlas.route_heading[row, nearest], offset[row, nearest]
-    forward = np.cos(heading) * offset.real + np.sin(heading) * offset.imag
+    columns = atlas.columns["route"]
+    dx, dy = motion[:, :1] - atlas.x[:, columns], motion[:, 1:2] - atlas.y[:, columns]  # [M, r]; padding is far away
+    nearest = (dx * dx + dy * dy).argmin(1)
+    heading = atlas.route_heading[row, nearest]
+    forward = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
     return np.where(atlas.route_length > 0, SPACING_M * nearest + forward, 0.0)

@@ -190,8 +190,8 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     # replayed agents alone have a log to go by
     age = np.where((world.drivers == Driver.REPLAY)[..., None], STEP_S * (np.arange(TOTAL_STEPS) - last_logged), 0.0)
     return Atlas(
-        x=np.concatenate([middle.real for middle in middles.values()], 1),
-        y=np.concatenate([middle.imag for middle in middles.values()], 1),
+        x=np.concatenate([np.real(middle) for middle in middles.values()], 1),
+        y=np.concatenate([np.imag(middle) for middle in middles.values()], 1),
         index=np.concatenate(list(index.values()), 1),
         columns={name: slice(*ends[i : i + 2]) for i, name in enumerate(middles)},
         points=points,
@@ -414,12 +414,12 @@ def _compare_with_lane(
     turn = atlas.lane_direction.reshape(-1, SEGMENT_POINTS).take(lanes, axis=0).reshape(len(lanes), -1)
     offset = offset[:, : turn.shape[1]]
     # the point that is nearest among those of lanes that run the agent's way
-    along = turn.real * forward.real + turn.imag * forward.imag
-    squared = np.where(along > 0, _measure_square(offset.real.copy(), offset.imag.copy()), np.inf)
+    squared = _measure_square(np.real(offset).copy(), np.imag(offset).copy())
+    squared[np.real(turn * forward.conj()) <= 0] = np.inf
     squared.reshape(*lanes.shape, -1)[is_hidden] = np.inf
     best = np.arange(len(lanes)), squared.argmin(1)
     direction = turn[best].conj()
-    turn, lateral = forward[:, 0] * direction, -(offset[best] * direction).imag
+    turn, lateral = forward[:, 0] * direction, -np.imag(offset[best] * direction)
     limit = atlas.lane_rows.reshape(-1, atlas.lane_rows.shape[2])[lanes[best[0], best[1] // SEGMENT_POINTS], -4]
-    values = np.array([turn.real, turn.imag, lateral, limit])
+    values = np.array([np.real(turn), np.imag(turn), lateral, limit])
     return np.where(np.isfinite(squared[best]), values, 0.0).T
