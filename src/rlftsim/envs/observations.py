@@ -249,7 +249,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     position, forward = _to_complex(motion[:, :2]), np.cos(motion[:, 2:3]) + 1j * np.sin(motion[:, 2:3])  # [M, 1]
     rotation = forward.conj() if frame == "ego" else np.ones_like(forward)
 
-    def to_frame(offset: Complex[np.ndarray, "*m"]) -> Complex[np.ndarray, "*m"]:
+    def to_frame(offset):  # without types, which would be read anew at every step
         return offset * rotation if frame == "ego" else offset + position
 
     is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
