@@ -167,11 +167,11 @@ class Bicycle(Controls):
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
         """Motion of vehicles after 0.1 s by actions [M, 2]."""
         _check_vehicles(actors, "bicycle")
-        bounded = np.clip(action, -1.0, 1.0)
+        bounded = action.clip(-1.0, 1.0)
         is_braking = (bounded[:, 0] < 0) & (signed_speed(actors.motion) > 0)
         acceleration = bounded[:, 0] * np.where(is_braking, self.max_braking, ACCELERATION_MPS2)
         motion = self.drive(actors.motion, acceleration, bounded[:, 1] * STEERING_RAD, actors.size[:, 0])
-        return Moves(motion[:, None], np.any(bounded != action, axis=1))
+        return Moves(motion[:, None], (bounded != action).any(1))
 
     def drive(
         self,

@@ -5,6 +5,7 @@ B scenes in step, M planner-driven agents over all scenes. An `Episode` does not
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,30 @@ class Episode:
     def num_agents(self) -> int:
         """M."""
         return len(self.world.actors)
+
+    @cached_property
+    def size(self) -> Float[np.ndarray, "M 2"]:
+        """Length and width of the planner-driven agents, m."""
+        return self.world.size[tuple(self.world.actors.T)]
+
+    @cached_property
+    def object_type(self) -> Int64[np.ndarray, "M"]:
+        """Types of the planner-driven agents."""
+        return self.world.object_type[tuple(self.world.actors.T)]
+
+    @cached_property
+    def reach_m(self) -> Float[np.ndarray, "M A"]:
+        """Distance beyond which boxes cannot overlap, half of both diagonals; negative for an agent itself."""
+        diagonal = np.hypot(self.world.size[..., 0], self.world.size[..., 1])
+        scene, agent = self.world.actors.T
+        reach = (diagonal[scene] + diagonal[scene, agent][:, None]) / 2 + 1e-6
+        reach[np.arange(self.num_agents), agent] = -1.0
+        return reach
+
+    @cached_property
+    def last_light_step(self) -> Int64[np.ndarray, "M"]:
+        """Last step with an observed light around each agent; -1 = there is none."""
+        return np.array([self.world.scenes[scene].lights.last_observed for scene, _ in self.world.actors], np.int64)
 
     def agent_name(self, row: int) -> str:
         """Scenario and object id of a planner-driven agent."""
@@ -146,23 +171,20 @@ def advance(
         ConfigError: no numbers, a NaN, a wrong shape, or an action that an agent cannot take.
     """
     motion = own_motion(episode, state.world)
-    scene, agent = episode.world.actors.T
-    actors = Actors(
-        episode.agent_name, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent]
-    )
+    actors = Actors(episode.agent_name, motion, episode.size, episode.object_type)
     action = validate_actions(action, episode.controls, episode.agent_name, episode.num_agents)
     moves = episode.controls.move(action, actors)
     motions = moves.motion if imposed is None else np.where(np.isnan(imposed), moves.motion, imposed)
     terms = {}
     for step in range(episode.controls.steps):
+        moved = motions[:, step].copy()
         # an agent whose episode is over stands still
-        stands = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], -1)
-        moved = np.where(state.ended[:, None], stands, motions[:, step])
+        moved[state.ended, :3], moved[state.ended, 3:] = motion[state.ended, :3], 0.0
         state, step_terms = _step(episode, state, moved)
         terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
-    following = _with_ends(episode, state)
+    following, stopped = _with_ends(episode, state)
     ends = following.ended & ~state.ended
-    terminated = ends & _stopped(episode, state)
+    terminated = ends & stopped
     reward = sum((term.weight * terms[term.name] for term in episode.terms), np.zeros(episode.num_agents))
     reward, truncated = np.where(state.ended, 0.0, reward), ends & ~terminated
     return following, Outcome(reward, terms, terminated, truncated, moves.is_clipped)
@@ -185,7 +207,7 @@ def repeat(
             state = _with_dice(episode, state, dice[step // policy.steps_per_decision])
         state, _ = _step(episode, state, moved)
         if (step + 1) % episode.controls.steps == 0:
-            state = _with_ends(episode, state)
+            state, _ = _with_ends(episode, state)
     return _with_dice(episode, state, dice[-1])
 
 
@@ -197,18 +219,19 @@ def _with_dice(episode: Episode, state: EpisodeState, dice: tuple[Dice, ...]) ->
 
 def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
     """True = an event of `stop_on` has happened to the agent."""
-    events = {
-        "collision": np.array([bool(collisions) for collisions in state.collisions], bool),
-        "offroad": state.outside,
-        "goal": state.at_goal,
-    }
-    return np.any([events[name] for name in episode.config.stop_on] or [np.zeros(episode.num_agents, bool)], axis=0)
+    stopped = np.zeros(episode.num_agents, bool)
+    for name in episode.config.stop_on:
+        if name == "collision":
+            stopped |= [bool(collisions) for collisions in state.collisions]
+        else:
+            stopped |= state.outside if name == "offroad" else state.at_goal
+    return stopped
 
 
-def _with_ends(episode: Episode, state: EpisodeState) -> EpisodeState:
-    """The same state, with marks for the agents whose episode ends here."""
-    is_over = state.world.step >= episode.config.max_steps
-    return replace(state, ended=state.ended | _stopped(episode, state) | is_over)
+def _with_ends(episode: Episode, state: EpisodeState) -> tuple[EpisodeState, Bool[np.ndarray, "M"]]:
+    """The same state, with marks for the agents whose episode ends here, and True for those that an event stops."""
+    is_over, stopped = state.world.step >= episode.config.max_steps, _stopped(episode, state)
+    return replace(state, ended=state.ended | stopped | is_over), stopped
 
 
 def _step(
@@ -219,21 +242,20 @@ def _step(
     world = step_world(episode.world, state.world, moved)
     # 1. contacts with tracks that have not been touched
     contacts = _contacts(episode, world, moved) & ~state.touched
-    collisions = [list(earlier) for earlier in state.collisions]
+    collisions, (new_collisions, at_fault) = list(state.collisions), np.zeros((2, episode.num_agents))
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
-        scene, ego = episode.world.actors[row]
-        collisions[row].append(
-            classify_collision(
-                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, ego],
-                _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
-            )
+        scene, _ = episode.world.actors[row]
+        collision = classify_collision(
+            episode.world.scenes[scene], world.step, int(agent), moved[row], episode.size[row],
+            _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
         )  # fmt: skip
-    new_collisions = [current[len(earlier) :] for current, earlier in zip(collisions, state.collisions)]
+        collisions[row] = (*collisions[row], collision)
+        new_collisions[row] += 1.0
+        at_fault[row] += collision.at_fault
     # 2. road and route
-    scene, agent = episode.world.actors.T
-    half_diagonal = np.hypot(*episode.world.size[scene, agent].T) / 2
-    turned = np.abs(wrapped(moved[:, 2] - previous[:, 2])) * half_diagonal
-    clear = state.clear_m - np.hypot(*(moved[:, :2] - previous[:, :2]).T) - turned
+    step = moved - previous
+    half_diagonal = np.hypot(episode.size[:, 0], episode.size[:, 1]) / 2
+    clear = state.clear_m - np.hypot(step[:, 0], step[:, 1]) - np.abs(wrapped(step[:, 2])) * half_diagonal
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
         clear[unclear] = _free_way_m(episode, world, unclear)
@@ -242,20 +264,18 @@ def _step(
     progress = _progress(episode, moved)
     gained = progress - state.progress
     routeless = episode.atlas.route_length == 0
-    step = moved[:, :2] - previous[:, :2]
     forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
-    ends = episode.atlas.route_points[np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)]
-    near_end = np.linalg.norm(moved[:, :2] - ends, axis=-1) <= AT_GOAL_M
+    near_end = np.abs(moved[:, 0] + 1j * moved[:, 1] - episode.atlas.route_end) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {
         "progress": np.where(routeless, forward, gained) / 10.0,
-        "collision": np.array([float(len(contacts)) for contacts in new_collisions]),
-        "at_fault": np.array([float(sum(collision.at_fault for collision in contacts)) for contacts in new_collisions]),
+        "collision": new_collisions,
+        "at_fault": at_fault,
         "offroad": (outside & ~state.outside).astype(float),
         "goal": (at_goal & ~state.at_goal).astype(float),
     }
     following = EpisodeState(
-        world, state.touched | contacts, tuple(map(tuple, collisions)), outside, at_goal, clear, progress, state.ended
+        world, state.touched | contacts, tuple(collisions), outside, at_goal, clear, progress, state.ended
     )
     return following, terms
 
@@ -321,7 +341,7 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
     scene, agent = episode.world.actors[rows].T
     motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
-    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[scene])
+    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[rows])
     free = distance.min(1) - SIMPLIFIED_M
     unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_alongside).all(1) | episode.world.has_levels[scene])
     free += OUTSIDE_M
@@ -332,26 +352,30 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
 
 def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 5"]) -> Bool[np.ndarray, "M A"]:
     """Tracks that each planner-driven agent overlaps now."""
-    scene, agent = episode.world.actors.T
-    size = episode.world.size
-    is_touchable = find_presence(episode.world, world)[1][scene, :, -1]
-    is_touchable[np.arange(len(scene)), agent] = False
-    tracks = world.motion[scene]  # [M, A, 5]
-    gap, agent_size = tracks[..., :2] - motion[:, None, :2], size[scene, agent][:, None]
-    meets = is_touchable & boxes_overlap(gap, motion[:, None, 2], tracks[..., 2], agent_size, size[scene])
+    tracks = world.motion[episode.world.actors[:, 0]]  # [M, A, 5]
+    gap = tracks[..., :2] - motion[:, None, :2]
+    # few boxes are in reach of each other
+    meets = find_presence(episode.world, world)[1][episode.world.actors[:, 0], :, -1]
+    meets &= np.hypot(gap[..., 0], gap[..., 1]) <= episode.reach_m
+    row, other = np.nonzero(meets)
+    if not len(row):
+        return meets
+    scene, agent = episode.world.actors[row].T
+    size = episode.world.size[scene, other]
+    meets[row, other] = boxes_overlap(gap[row, other], motion[row, 2], tracks[row, other, 2], episode.size[row], size)
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
-        rise = z[scene] - z[scene, agent][:, None]
-        is_same_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
-        meets &= is_same_level | ~episode.world.has_levels[scene][:, None]
+        rise = z[scene, other] - z[scene, agent]
+        is_same_level = heights_overlap(rise, height[scene, agent], height[scene, other])
+        meets[row, other] &= is_same_level | ~episode.world.has_levels[scene]
     return meets
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
     """Distance of each agent along the route, as `Route.progress`, for all at once."""
     atlas, row = episode.atlas, np.arange(len(motion))
-    dx = motion[:, :1] - atlas.route_points[..., 0]  # [M, r]; padding is far away
-    dy = motion[:, 1:2] - atlas.route_points[..., 1]
+    columns = atlas.columns["route"]
+    dx, dy = motion[:, :1] - atlas.x[:, columns], motion[:, 1:2] - atlas.y[:, columns]  # [M, r]; padding is far away
     nearest = (dx * dx + dy * dy).argmin(1)
     heading = atlas.route_heading[row, nearest]
     forward = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]

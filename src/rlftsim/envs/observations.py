@@ -5,17 +5,19 @@ Frame: the observing agent's own at the present step (x ahead, y left), or the m
 Unused rows are zeros, and 0 in the mask. Things above or below the agent's road, as at a bridge, are left out.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int8, Int64
+from jaxtyping import Bool, Complex, Float, Float32, Int8, Int64
 
-from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed, to_heading_frame
+from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
 from rlftsim.envs.drivers import Driver
 from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import Route, compute_headings
-from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW
+from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW, Lights
 from rlftsim.envs.world import World, WorldState, find_lights, find_presence, padded
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
@@ -31,6 +33,9 @@ HISTORY = 10
 OWN_LANES = 12
 """Nearest pieces that an agent's own lane is searched among."""
 _FAR_M = 1e7
+_ROW_BITS = (1 << 24) - 1
+_SEEN_KEY = int(np.float64(SEEN_M * SEEN_M).view(np.int64)) | _ROW_BITS
+_COLORS = np.array([RED, YELLOW, GREEN])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,33 +94,48 @@ SHAPES: dict[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Maps of B scenes side by side, and the routes of M agents: cut once for each episode. Padding is far away."""
+    """Maps and routes around M agents, cut once for each episode. Points are x + iy; padding is far away."""
 
-    lane_points: Float[np.ndarray, "B n 10 2"]
-    lane_heading: Float[np.ndarray, "B n 10"]
-    lane_middle: Float[np.ndarray, "B n 2"]
-    lane_facts: Float[np.ndarray, "B n 3"]
-    """Class, speed limit, stop sign."""
-    lane_light: Int64[np.ndarray, "B n"]
-    """Index of the light; the last one is none."""
-    on_route: Bool[np.ndarray, "M n"]
-    edges: Float[np.ndarray, "B e 4"]
-    edge_middle: Float[np.ndarray, "B e 2"]
-    crossings: Float[np.ndarray, "B c 8"]
-    crossing_middle: Float[np.ndarray, "B c 2"]
-    light_point: Float[np.ndarray, "B T1 2"]
-    """The last light of each scene is none, far away."""
-    last_logged: Int64[np.ndarray, "B A 91"]
-    """Last step with a logged state, up to each step."""
+    x: Float[np.ndarray, "M N"]
+    """Middles of all lanes, edges, crossings, lights and route points, and space for the agents, side by side."""
+    y: Float[np.ndarray, "M N"]
+    index: Int64[np.ndarray, "M N"]
+    """Rows of these things in the arrays below, counted over all agents."""
+    columns: dict[str, slice]
+    """Columns of "lanes", "edges", "crossings", "lights", "neighbors" and "route" in `x`, `y` and `index`."""
+    points: dict[str, Complex[np.ndarray, "M n p"]]
+    """All points of lanes, edges, crossings and lights."""
+    lane_direction: Complex[np.ndarray, "M n 10"]
+    """Unit vectors along the lanes."""
+    lane_rows: Float32[np.ndarray, "M n 25"]
+    """Space for points, class, speed limit, space for the light, on the route, stop sign."""
+    lane_light: Int64[np.ndarray, "M n"]
+    """Index of the light among those of all agents; an agent's last one is none."""
+    lights: tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]
+    """States and ages of the lights in the log; the last light is none, far away."""
+    agent_facts: Float32[np.ndarray, "B A 3"]
+    """Length, width, class."""
+    log_age_s: Float32[np.ndarray, "91 B A"]
+    """Age of the last logged state of replayed agents."""
     routes: tuple[Route, ...]
-    route_points: Float[np.ndarray, "M r 2"]
-    """Points beyond a route's end are far away."""
+    route_points: Complex[np.ndarray, "M r"]
+    """Points beyond a route's end are far away, as many as are shown."""
     route_heading: Float[np.ndarray, "M r"]
     route_limit: Float[np.ndarray, "M r"]
     route_length: Int64[np.ndarray, "M"]
     route_ground: Float[np.ndarray, "M r"]
     heights: dict[str, RouteHeights]
     """Of pieces of lanes ("lanes"), "edges", "crossings" and "lights"; empty where no scene has levels."""
+
+    @cached_property
+    def edges(self) -> Float[np.ndarray, "M e 4"]:
+        """Segments of road edges around each agent."""
+        return self.points["edges"].view(np.float64)
+
+    @cached_property
+    def route_end(self) -> Complex[np.ndarray, "M"]:
+        """Last points of the routes; far away without one."""
+        return self.route_points[np.arange(len(self.routes)), np.maximum(self.route_length - 1, 0)]
 
 
 def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
@@ -125,58 +145,90 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         world: Scenes that step together, with the drivers of all agents.
         routes: Routes of the M planner-driven agents, in the order of `world.actors`.
     """
-    scenes = world.scenes
-    points = _stack([scene.lanes.points for scene in scenes], _FAR_M)
-    num_lights = max(len(scene.lights.lane) for scene in scenes)
-    lane_light = _stack([np.where(s.lanes.light < 0, num_lights, s.lanes.light) for s in scenes], num_lights)
-    owner = _stack([scene.lanes.lane for scene in scenes], -1)
-    light_point = padded([s.lights.point for s in scenes], (len(scenes), num_lights + 1, 2), _FAR_M)
+    rows, scenes = world.actors[:, 0], world.scenes
+    num_lights = max(LIGHTS, 1 + max(len(scene.lights.lane) for scene in scenes))
+    owner = _stack([scene.lanes.lane for scene in scenes], -1, LANES)
     facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
-    edges, crossings = _stack([s.edges for s in scenes], _FAR_M), _stack([s.crossings for s in scenes], _FAR_M)
-    on_route = [np.isin(owner[b], route.lanes) for (b, _), route in zip(world.actors, routes)]
-    lane_middle, edge_middle = points[:, :, SEGMENT_POINTS // 2], (edges[..., :2] + edges[..., 2:]) / 2
-    crossing_middle = crossings.reshape(*crossings.shape[:2], 4, 2).mean(2)
-    route_points = _stack([route.points for route in routes] or [np.zeros((0, 2))], _FAR_M)
-    route_ground = _stack([route.ground for route in routes] or [np.zeros(0)], 0.0)
+    lane_rows = np.zeros((*owner[rows].shape, SHAPES["lanes"][1]), np.float32)
+    lane_rows[..., [-5, -4, -1]] = _stack(facts, 0.0, LANES)[rows]
+    for row, route in enumerate(routes):
+        lane_rows[row, :, -2] = np.isin(owner[rows[row]], route.lanes)
+    lane_light = [np.where(s.lanes.light < 0, num_lights - 1, s.lanes.light) for s in scenes]
+    lane_light = _stack(lane_light, num_lights - 1, LANES)[rows] + num_lights * np.arange(len(rows))[:, None]
+    lane_points = _stack([scene.lanes.points for scene in scenes], _FAR_M, LANES)
+    corners = {
+        "lanes": lane_points.reshape(*owner.shape, -1),
+        "edges": _stack([scene.edges for scene in scenes], _FAR_M, EDGES),
+        "crossings": _stack([scene.crossings for scene in scenes], _FAR_M, CROSSINGS),
+        "lights": _stack([scene.lights.point for scene in scenes], _FAR_M, num_lights),
+    }
+    points = {name: _to_complex(array)[rows] for name, array in corners.items()}
+    beyond = np.full((ROUTE, 2), _FAR_M)  # a route shows as many points at its end as anywhere
+    route_xy = _stack([np.concatenate([route.points, beyond]) for route in routes], _FAR_M, ROUTE)
+    route_points = _to_complex(route_xy)[..., 0]
+    route_ground = padded([route.ground for route in routes], route_points.shape)
+    space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), _FAR_M + 0j)
+    middles = {name: array.mean(-1) for name, array in points.items()}
+    middles |= {"lanes": points["lanes"][..., SEGMENT_POINTS // 2], "neighbors": space, "route": route_points}
+    index = {name: np.arange(middle.size).reshape(middle.shape) for name, middle in middles.items()}
+    num_agents = world.mask.shape[1]
+    index["neighbors"] = np.minimum(np.arange(space.shape[1]), num_agents - 1) + num_agents * rows[:, None]
+    ends = np.cumsum([0, *(middle.shape[1] for middle in middles.values())])
     heights: dict[str, RouteHeights] = {}
     if world.has_levels.any():
         features = {
-            "lanes": (lane_middle, [s.lanes.z[:, SEGMENT_POINTS // 2] for s in scenes]),
-            "edges": (edge_middle, [s.edges_z for s in scenes]),
-            "crossings": (crossing_middle, [s.crossings_z for s in scenes]),
-            "lights": (light_point, [s.lights.z for s in scenes]),
+            "lanes": [s.lanes.z[:, SEGMENT_POINTS // 2] for s in scenes],
+            "edges": [s.edges_z for s in scenes],
+            "crossings": [s.crossings_z for s in scenes],
+            "lights": [s.lights.z for s in scenes],
         }
-        scene_rows = world.actors[:, 0]
-        for name, (middle, z) in features.items():
-            padded_z = padded(z, middle.shape[:2])
-            heights[name] = RouteHeights.measure(middle[scene_rows], padded_z[scene_rows], route_points, route_ground)
+        for name, z in features.items():
+            middle = middles[name]
+            padded_z = padded(z, (len(scenes), middle.shape[1]))[rows]
+            heights[name] = RouteHeights.measure(middle[..., None].view(np.float64), padded_z, route_xy, route_ground)
+    last_logged = np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2)
+    # replayed agents alone have a log to go by
+    age = np.where((world.drivers == Driver.REPLAY)[..., None], STEP_S * (np.arange(TOTAL_STEPS) - last_logged), 0.0)
     return Atlas(
-        lane_points=points,
-        lane_heading=compute_headings(points),
-        lane_middle=lane_middle,
-        lane_facts=_stack(facts, 0.0),
+        x=np.concatenate([np.real(middle) for middle in middles.values()], 1),
+        y=np.concatenate([np.imag(middle) for middle in middles.values()], 1),
+        index=np.concatenate(list(index.values()), 1),
+        columns={name: slice(*ends[i : i + 2]) for i, name in enumerate(middles)},
+        points=points,
+        lane_direction=np.exp(1j * compute_headings(lane_points))[rows],
+        lane_rows=lane_rows,
         lane_light=lane_light,
-        on_route=np.stack(on_route) if on_route else np.zeros((0, owner.shape[1]), bool),
-        edges=edges,
-        edge_middle=edge_middle,
-        crossings=crossings,
-        crossing_middle=crossing_middle,
-        light_point=light_point,
-        last_logged=np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2),
+        lights=_stack_lights([scene.lights for scene in scenes], num_lights),
+        agent_facts=np.concatenate([world.size, world.object_type[..., None]], -1).astype(np.float32),
+        log_age_s=np.moveaxis(age, 2, 0).astype(np.float32),
         routes=routes,
         route_points=route_points,
-        route_heading=_stack([route.heading for route in routes] or [np.zeros(0)], 0.0),
-        route_limit=_stack([route.limit_mps for route in routes] or [np.zeros(0)], 0.0),
+        route_heading=padded([route.heading for route in routes], route_points.shape),
+        route_limit=padded([route.limit_mps for route in routes], route_points.shape),
         route_length=np.array([len(route) for route in routes], np.int64),
         route_ground=route_ground,
         heights=heights,
     )
 
 
-def _stack(arrays: list[np.ndarray], fill: float | int) -> np.ndarray:
-    """Arrays of different lengths, padded to the longest, at least to a single row."""
-    longest = max(1, *(len(array) for array in arrays))
+def _stack(arrays: list[np.ndarray], fill: float | int, least: int) -> np.ndarray:
+    """Arrays of different lengths, padded to the longest, at least to so many rows."""
+    longest = max(least, *(len(array) for array in arrays))
     return padded(arrays, (len(arrays), longest, *arrays[0].shape[1:]), fill)
+
+
+def _to_complex(points: Float[np.ndarray, "*n c"]) -> Complex[np.ndarray, "*n p"]:
+    """Points x + iy, of coordinates x, y, x, y, ... on the last axis."""
+    return np.ascontiguousarray(points).view(np.complex128)
+
+
+def _stack_lights(
+    lights: Sequence[Lights], count: int
+) -> tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]:
+    """States and ages of the lights of each scene, padded with lights that are none."""
+    shape = len(lights), count, TOTAL_STEPS
+    states, ages = padded([s.state.T for s in lights], shape, 0), padded([s.age_s.T for s in lights], shape)
+    return np.moveaxis(states, 2, 0), np.moveaxis(ages, 2, 0)
 
 
 def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "ego", steps: int) -> Observation:
@@ -190,111 +242,115 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         steps: Length of the episode in steps of 0.1 s, for the time that is left.
     """
     scene, agent = world.actors.T
-    row, count = np.arange(len(scene)), len(scene)
-    motion = state.motion[scene, agent]  # [M, 5]
-    log_step = len(state.track) - 1
-    is_ego_frame = frame == "ego"
-    origin, angle = (motion[:, :2], motion[:, 2]) if is_ego_frame else (np.zeros((count, 2)), np.zeros(count))
+    row, count, log_step = np.arange(len(scene)), len(scene), len(state.track) - 1
+    past = np.array(state.track[-HISTORY - 1 :])  # [11, B, A, 5]
+    others = past[-1].take(scene, axis=0)  # [M, A, 5]
+    motion = others[row, agent]  # [M, 5]
+    position, forward = _to_complex(motion[:, :2]), np.cos(motion[:, 2:3]) + 1j * np.sin(motion[:, 2:3])  # [M, 1]
+    rotation = forward.conj() if frame == "ego" else np.ones_like(forward)
 
-    # 1. Motion over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
-    past = np.stack(state.track[-HISTORY - 1 :], 1)[scene]
-    is_present = np.moveaxis(find_presence(world, state)[0][scene, :, log_step - HISTORY :], 2, 1)  # [M, 11, A]
-    neighbor_distance = _distance(motion, past[:, -1])
-    neighbor_distance[~is_present[:, -1]] = np.inf
-    neighbor_distance[row, agent] = np.inf
-    middles = {"lanes": atlas.lane_middle, "edges": atlas.edge_middle, "crossings": atlas.crossing_middle}
-    middles["lights"] = atlas.light_point
-    distances = {name: _distance(motion, points[scene]) for name, points in middles.items()}
-    distances["neighbors"] = neighbor_distance
-    nearest_on_route = _distance(motion, atlas.route_points).argmin(1)
+    def to_frame(offset):  # without types, which would be read anew at every step
+        return offset * rotation if frame == "ego" else offset + position
+
+    is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
+
+    # 1. Squared distances, infinite where there is nothing to see.
+    squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]
+    distances = {name: squared[:, columns] for name, columns in atlas.columns.items()}
+    nearest_on_route = distances.pop("route").argmin(1)
+    to_others = distances["neighbors"][:, : others.shape[1]]
+    to_others[...] = _measure_square(others[..., 0] - motion[:, :1], others[..., 1] - motion[:, 1:2])
+    to_others[~is_present[..., -1].take(scene, axis=0)] = np.inf
+    lights = atlas.lights
+    if state.sumo_states:
+        lights = _stack_lights(find_lights(world, state), lights[0].shape[2])
+    color, light_age = lights[0][log_step].take(scene, axis=0), lights[1][log_step].take(scene, axis=0)  # [M, T1]
+    distances["lights"][color == 0] = np.inf
     if atlas.heights:
-        _leave_out_other_levels(world, atlas, state, nearest_on_route, distances)
-    neighbor, has_neighbor = _nearest(neighbor_distance, NEIGHBORS)
-    steps_back = np.arange(HISTORY + 1)[:, None]
-    neighbor_motion = past[row[:, None, None], steps_back, neighbor[:, None]]  # [M, 11, K, 5]
-    is_neighbor_present = is_present[row[:, None, None], steps_back, neighbor[:, None]] & has_neighbor[:, None]
-    ego_motion = past[row, :, agent]  # [M, 11, 5]
-    # 2. The nearest rows of the map, lights whose state is known, and the route from the nearest place on.
-    lane, has_lane = _nearest(distances["lanes"], LANES)
-    edge, has_edge = _nearest(distances["edges"], EDGES)
-    area, has_area = _nearest(distances["crossings"], CROSSINGS)
-    lights, shape = find_lights(world, state), atlas.light_point.shape[:2]
-    colors = padded([scene_lights.state[log_step] for scene_lights in lights], shape, 0)[scene]  # [M, T + 1]
-    ages = padded([scene_lights.age_s[log_step] for scene_lights in lights], shape)[scene]
-    light_distance = distances["lights"]
-    light_distance[colors == 0] = np.inf
-    light, has_light = _nearest(light_distance, LIGHTS)
+        _leave_out_other_levels(world, atlas, state, nearest_on_route, {**distances, "neighbors": to_others})
+    to_others[row, agent] = -1.0  # each agent comes before its neighbors
+    # 2. The nearest rows in order. The bits of a positive number sort as the number does; the lowest ones, which tell
+    # fractions of a micrometer apart, give way to the row, as numbers are sorted faster than rows by numbers.
+    keys = squared.view(np.int64)
+    keys &= ~_ROW_BITS
+    keys |= atlas.index
+    rows, is_hidden = {}, {}
+    for name in distances:
+        nearest, num_shown = keys[:, atlas.columns[name]], SHAPES[name][0] + (name == "neighbors")
+        if nearest.shape[1] > num_shown:
+            nearest.partition(num_shown - 1, axis=1)
+        nearest = nearest[:, :num_shown]
+        nearest.sort(axis=1)
+        rows[name], is_hidden[name] = nearest & _ROW_BITS, nearest > _SEEN_KEY
+    # 3. The map in the frame of the agents.
+    arrays = {name: np.empty((count, *SHAPES[name]), np.float32) for name in ("ego", "route", "goal", *distances)}
+    arrays["lanes"] = atlas.lane_rows.reshape(-1, atlas.lane_rows.shape[2]).take(rows["lanes"], axis=0)
+    arrays["lanes"][..., -3] = color.take(atlas.lane_light.take(rows["lanes"]))
+    for name, points in atlas.points.items():
+        size = points.shape[2]
+        offset = points.reshape(-1, size).take(rows[name], axis=0).reshape(count, -1)  # [M, k p]
+        offset -= position
+        if name == "lanes":
+            first = slice(OWN_LANES)
+            beside_lane = _compare_with_lane(atlas, forward, offset, rows[name][:, first], is_hidden[name][:, first])
+        _view_points(arrays[name], size)[...] = to_frame(offset).reshape(count, -1, size)
+    lamps = arrays["lights"][..., 2:]
+    lamps[..., :3] = color.take(rows["lights"])[..., None] == _COLORS
+    lamps[..., 3] = light_age.take(rows["lights"])
+    # 4. The route from the nearest place on, and its end.
     index = nearest_on_route[:, None] + np.arange(ROUTE)
-    on_route = index < atlas.route_length[:, None]
-    index = np.minimum(index, atlas.route_points.shape[1] - 1)
-    segments = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
-    # 3. All points in the frame of the agents, at once, and split again.
-    groups = [
-        neighbor_motion[..., :2], ego_motion[..., :2], segments, atlas.edges[scene[:, None], edge],
-        atlas.crossings[scene[:, None], area],
-        atlas.light_point[scene[:, None], light], atlas.route_points[row[:, None], index],
-        atlas.route_points[row, np.maximum(atlas.route_length - 1, 0)],
-    ]  # fmt: skip
-    points = np.concatenate([group.reshape(count, -1, 2) for group in groups], 1)
-    ends = np.cumsum([group.size // (2 * count) for group in groups])[:-1] if count else [0] * (len(groups) - 1)
-    x, y = points[..., 0] - origin[:, :1], points[..., 1] - origin[:, 1:]
-    if is_ego_frame:
-        x, y = to_heading_frame(x, y, angle[:, None])
-    local = np.split(np.stack([x, y], -1), ends, axis=1)
-    neighbor_points, ego_points, lane_points, edges, crossings, light_points, route_points, end = local
-    # 4. Columns.
-    direction = neighbor_motion[..., 2] - angle[:, None, None]
-    poses = np.empty((*direction.shape, 4), np.float32)  # [M, 11, K, 4]
-    poses[..., :2] = neighbor_points.reshape(*direction.shape, 2)
-    poses[..., 2], poses[..., 3] = np.cos(direction), np.sin(direction)
-    vx, vy = neighbor_motion[:, -1, :, 3], neighbor_motion[:, -1, :, 4]
-    velocity = np.stack(to_heading_frame(vx, vy, angle[:, None]), -1)
-    is_replayed = world.drivers[scene[:, None], neighbor] == Driver.REPLAY  # they alone have a log to go by
-    age = np.where(is_replayed, STEP_S * (log_step - atlas.last_logged[scene[:, None], neighbor, log_step]), 0.0)
-    size, object_type = world.size[scene[:, None], neighbor], world.object_type[scene[:, None], neighbor]
-    neighbors = np.concatenate([poses[:, -1], velocity, size, object_type[..., None], age[..., None]], -1)
-    history = np.where(is_neighbor_present[:, :-1, :, None], poses[:, :-1], np.float32(0.0))
-    history = np.moveaxis(history, 1, 2)  # [M, K, 10, 4]
-    lane_facts = atlas.lane_facts[scene[:, None], lane]
-    lanes = np.concatenate([
-        lane_points.reshape(count, lane.shape[1], -1), lane_facts[..., :2],
-        colors[row[:, None], atlas.lane_light[scene[:, None], lane]][..., None],
-        atlas.on_route[row[:, None], lane][..., None], lane_facts[..., 2:],
-    ], -1)  # fmt: skip
-    color = colors[row[:, None], light]
-    lamps = [color == RED, color == YELLOW, color == GREEN, ages[row[:, None], light]]
-    lamp_rows = np.concatenate([light_points, np.stack(lamps, -1)], -1)
-    route = np.concatenate([route_points, atlas.route_limit[row[:, None], index][..., None]], -1)
-    goal = np.concatenate([end[:, 0], np.ones((count, 1))], -1)
-    ego_direction = ego_motion[..., 2] - angle[:, None]
-    ego_history = np.stack(
-        [*np.moveaxis(ego_points, -1, 0), np.cos(ego_direction), np.sin(ego_direction), signed_speed(ego_motion)], -1
-    )
-    ego_history = np.where(is_present[row, :, agent][..., None], ego_history, 0.0)
-    first = slice(OWN_LANES)
-    heading = atlas.lane_heading[scene[:, None], lane[:, first]]
-    ego = _about_itself(
-        world, ego_motion, segments[:, first], heading, has_lane[:, first], lane_facts[:, first, 1], steps - state.step
-    )
+    is_hidden["route"] = index >= atlas.route_length[:, None]
+    index += atlas.route_points.shape[1] * row[:, None]
+    _view_points(arrays["route"], 1)[..., 0] = to_frame(atlas.route_points.take(index) - position)
+    arrays["route"][..., 2] = atlas.route_limit.take(index)
+    _view_points(arrays["goal"], 1)[...] = to_frame(atlas.route_end[:, None] - position)
+    arrays["goal"][:, 2] = 1.0
+    is_hidden["goal"] = atlas.route_length == 0
+    # 5. The agent itself and its neighbors, now and at the ten steps before.
+    who, neighbors = rows["neighbors"], arrays["neighbors"]
+    moved = past.reshape(HISTORY + 1, -1, 5).take(who, axis=1)  # [11, M, 1 + K, 5]
+    offset = to_frame(_view_points(moved, 1)[..., 0] - position)
+    direction = moved[..., 2] - (motion[:, 2:3] if frame == "ego" else 0.0)
+    history = np.empty((*who.shape, HISTORY, 4), np.float32)  # [M, 1 + K, 10, 4]
+    _view_points(history, 1)[..., 0] = offset[:-1].transpose(1, 2, 0)
+    before = direction[:-1].transpose(1, 2, 0).astype(np.float32)
+    history[..., 2], history[..., 3] = np.cos(before), np.sin(before)
+    is_absent = ~is_present.reshape(-1, HISTORY + 1).take(who, axis=0)  # [M, 1 + K, 11]
+    is_absent |= is_hidden["neighbors"][..., None]
+    history.view(np.complex128)[is_absent[..., :-1]] = 0.0  # four numbers at once
+    is_hidden["neighbors"] = is_hidden["neighbors"][:, 1:]
+    _view_points(neighbors, 1)[..., 0] = offset[-1, :, 1:]
+    neighbors[..., 2], neighbors[..., 3] = np.cos(direction[-1, :, 1:]), np.sin(direction[-1, :, 1:])
+    _view_points(neighbors[..., 4:], 1)[..., 0] = _view_points(moved[-1, :, 1:, 3:], 1)[..., 0] * rotation
+    neighbors[..., 6:9] = atlas.agent_facts.reshape(-1, 3).take(who[:, 1:], axis=0)
+    neighbors[..., 9] = atlas.log_age_s[log_step].take(who[:, 1:])
+    # 6. The agent's own numbers.
+    speed = signed_speed(moved[:, :, 0])  # [11, M]
+    ego_history = np.empty((count, *SHAPES["ego_history"]), np.float32)
+    _view_points(ego_history, 1)[..., 0], ego_history[..., 4] = offset[..., 0].T, speed.T
+    ego_history[..., 2], ego_history[..., 3] = np.cos(direction[..., 0].T), np.sin(direction[..., 0].T)
+    ego_history[is_absent[:, 0]] = 0.0
+    yaw_rate = wrapped(motion[:, 2] - moved[-2, :, 0, 2]) / STEP_S
+    ego, facts, length = arrays["ego"], atlas.agent_facts[scene, agent], world.size[scene, agent, 0]
+    is_moving = np.abs(speed[-1]) > 0.1
+    turn = WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(is_moving, speed[-1], 1.0)
+    ego[:, 0], ego[:, 1], ego[:, 2] = speed[-1], (speed[-1] - speed[-2]) / STEP_S, yaw_rate
+    ego[:, 3], ego[:, 4:6], ego[:, 6:10] = np.where(is_moving, np.arctan(turn), 0.0), facts[:, :2], beside_lane
+    ego[:, 10], ego[:, 11] = STEP_S * (steps - state.step), facts[:, 2]
 
-    return Observation(
-        ego=ego.astype(np.float32),
-        ego_history=ego_history.astype(np.float32),
-        neighbors=_rows(neighbors, has_neighbor, NEIGHBORS),
-        neighbors_mask=_masks(has_neighbor, NEIGHBORS),
-        neighbors_history=_rows(history.reshape(count, neighbor.shape[1], -1), has_neighbor, NEIGHBORS),
-        lanes=_rows(lanes, has_lane, LANES),
-        lanes_mask=_masks(has_lane, LANES),
-        edges=_rows(edges.reshape(count, -1, 4), has_edge, EDGES),
-        edges_mask=_masks(has_edge, EDGES),
-        crossings=_rows(crossings.reshape(count, -1, 8), has_area, CROSSINGS),
-        crossings_mask=_masks(has_area, CROSSINGS),
-        lights=_rows(lamp_rows, has_light, LIGHTS),
-        lights_mask=_masks(has_light, LIGHTS),
-        route=_rows(route, on_route, ROUTE),
-        route_mask=_masks(on_route, ROUTE),
-        goal=np.where((atlas.route_length > 0)[:, None], goal, 0.0).astype(np.float32),
-    )
+    for name, is_nothing in is_hidden.items():
+        arrays[name][is_nothing] = 0.0
+    masks = {f"{name}_mask": (~is_hidden[name]).view(np.int8) for name in ("route", *distances)}
+    history = history[:, 1:].reshape(count, NEIGHBORS, -1)
+    return Observation(**arrays, **masks, ego_history=ego_history, neighbors_history=history)
+
+
+def _measure_square(x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
+    """Squared lengths of vectors, which take the place of `x`; `y` is changed, too."""
+    x *= x
+    y *= y
+    x += y
+    return x
 
 
 def _leave_out_other_levels(
@@ -311,7 +367,7 @@ def _leave_out_other_levels(
         atlas: Maps and routes of the world.
         state: Present state of the world.
         nearest_on_route: Index of the route's point nearest to each agent.
-        distances: Distances from each agent to rows of the map and to "neighbors", changed in place.
+        distances: Squared distances from each agent to rows of the map and to "neighbors", changed in place.
     """
     scene, agent = world.actors.T
     height, z = world.height, state.z[-1]
@@ -320,10 +376,13 @@ def _leave_out_other_levels(
     above_route = ground - atlas.route_ground[np.arange(len(scene)), nearest_on_route]
     # a box as high as the agent's whose height difference is 0 stands on the same ground
     neighbors = RouteHeights.measure(
-        state.motion[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground
+        state.motion[scene][..., :2],
+        z[scene] - half,
+        atlas.route_points[..., None].view(np.float64),
+        atlas.route_ground,
     )
     for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
-        difference = heights.differences(distances[name], ground, above_route)
+        difference = heights.differences(np.sqrt(distances[name]), ground, above_route)
         if name == "neighbors":
             is_same_level = heights_overlap(difference, 2 * half, height[scene])
         else:
@@ -331,72 +390,36 @@ def _leave_out_other_levels(
         distances[name][world.has_levels[scene][:, None] & ~is_same_level] = np.inf
 
 
-def _rows(values: Float[np.ndarray, "M n c"], mask: Bool[np.ndarray, "M n"], length: int) -> np.ndarray:
-    """Float32 [M, length, c] with zeros in rows beyond the mask."""
-    out = np.zeros((len(values), length, values.shape[-1]), np.float32)
-    out[:, : values.shape[1]] = values
-    out[:, : values.shape[1]][~mask] = 0.0
-    return out
+def _view_points(array: np.ndarray, count: int) -> np.ndarray:
+    """The first 2 * count columns as so many points x + iy."""
+    return array[..., : 2 * count].view(np.complex64 if array.dtype == np.float32 else np.complex128)
 
 
-def _masks(mask: Bool[np.ndarray, "M n"], length: int) -> Int8[np.ndarray, "M length"]:
-    """Masks with zeros appended."""
-    out = np.zeros((len(mask), length), np.int8)
-    out[:, : mask.shape[1]] = mask
-    return out
+def _compare_with_lane(
+    atlas: Atlas,
+    forward: Complex[np.ndarray, "M 1"],
+    offset: Complex[np.ndarray, "M n"],
+    lanes: Int64[np.ndarray, "M L"],
+    is_hidden: Bool[np.ndarray, "M L"],
+) -> Float[np.ndarray, "M 4"]:
+    """Cosine and sine of the heading to the lane, lateral offset to it, speed limit; zeros away from lanes.
 
-
-def _distance(motion: Float[np.ndarray, "M 5"], points: np.ndarray) -> Float[np.ndarray, "M n"]:
-    """Distances from agents to points, of which x and y come first on the last axis."""
-    dx, dy = points[..., 0] - motion[:, :1], points[..., 1] - motion[:, 1:2]
-    return np.sqrt(dx * dx + dy * dy)
-
-
-def _nearest(
-    distance: Float[np.ndarray, "M n"], count: int
-) -> tuple[Int64[np.ndarray, "M k"], Bool[np.ndarray, "M k"]]:
-    """Indices of the nearest `count` columns of each row in order, and True up to a distance of 100 m."""
-    row = np.arange(len(distance))[:, None]
-    if distance.shape[1] > count:
-        # the nearest in any order first: a full sort of all rows would cost more than all the rest
-        index = np.argpartition(distance, count - 1, axis=1)[:, :count]
-        index = index[row, np.argsort(distance[row, index], axis=1, kind="stable")]
-    else:
-        index = np.argsort(distance, axis=1, kind="stable")
-    return index, distance[row, index] <= SEEN_M
-
-
-def _about_itself(
-    world: World,
-    motion: Float[np.ndarray, "M 11 5"],
-    segments: Float[np.ndarray, "M L 10 2"],
-    heading: Float[np.ndarray, "M L 10"],
-    has_lane: Bool[np.ndarray, "M L"],
-    limit: Float[np.ndarray, "M L"],
-    steps_left: int,
-) -> Float[np.ndarray, "M 12"]:
-    """The row `Observation.ego`."""
-    scene, agent = world.actors.T
-    current, previous = motion[:, -1], motion[:, -2]
-    speed = signed_speed(current)
-    yaw_rate = wrapped(current[:, 2] - previous[:, 2]) / STEP_S
-    length = world.size[scene, agent, 0]
-    moving = np.abs(speed) > 0.1
-    steering = np.where(moving, np.arctan(WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(moving, speed, 1.0)), 0.0)
-    # the lane point that is nearest among those of lanes that run the agent's way
-    offset = current[:, None, None, :2] - segments
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    is_same_direction = np.cos(heading - current[:, 2, None, None]) > 0
-    distance = np.where(is_same_direction & has_lane[..., None], distance, np.inf).reshape(len(motion), -1)
-    best, row = distance.argmin(1), np.arange(len(motion))
-    on_lane = np.isfinite(distance[row, best])
-    direction = heading.reshape(len(motion), -1)[row, best]
-    off = offset.reshape(len(motion), -1, 2)[row, best]
-    lateral = np.cos(direction) * off[:, 1] - np.sin(direction) * off[:, 0]
-    to_lane = current[:, 2] - direction
-    return np.stack([
-        speed, (speed - signed_speed(previous)) / STEP_S, yaw_rate, steering, length, world.size[scene, agent, 1],
-        np.where(on_lane, np.cos(to_lane), 0.0), np.where(on_lane, np.sin(to_lane), 0.0),
-        np.where(on_lane, lateral, 0.0), np.where(on_lane, limit[row, best // SEGMENT_POINTS], 0.0),
-        np.full(len(motion), STEP_S * steps_left), world.object_type[scene, agent],
-    ], -1)  # fmt: skip
+    Args:
+        atlas: Maps and routes of the world.
+        forward: Unit vectors along the agents.
+        offset: Offsets from the agents to the points of the nearest pieces of lanes, L of them or more, m.
+        lanes: Rows of the L nearest pieces in the atlas.
+        is_hidden: True = too far away.
+    """
+    turn = atlas.lane_direction.reshape(-1, SEGMENT_POINTS).take(lanes, axis=0).reshape(len(lanes), -1)
+    offset = offset[:, : turn.shape[1]]
+    # the point that is nearest among those of lanes that run the agent's way
+    squared = _measure_square(np.real(offset).copy(), np.imag(offset).copy())
+    squared[np.real(turn * forward.conj()) <= 0] = np.inf
+    squared.reshape(*lanes.shape, -1)[is_hidden] = np.inf
+    best = np.arange(len(lanes)), squared.argmin(1)
+    direction = turn[best].conj()
+    turn, lateral = forward[:, 0] * direction, -np.imag(offset[best] * direction)
+    limit = atlas.lane_rows.reshape(-1, atlas.lane_rows.shape[2])[lanes[best[0], best[1] // SEGMENT_POINTS], -4]
+    values = np.array([np.real(turn), np.imag(turn), lateral, limit])
+    return np.where(np.isfinite(squared[best]), values, 0.0).T

@@ -6,7 +6,8 @@ edges and center lines but no lane polygons, hence the suffix `_style`: "inside 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -85,14 +86,16 @@ def score_planner(record: Record) -> PlannerScores:
     Args:
         record: Record of the episode; a short episode is scored up to the end.
     """
-    components, missing = _score_components(record), missing_scores(record)
-    early_components = _score_components(record.first(PDMS_STEPS))
+    missing, steps, kinematics = missing_scores(record), _measure_steps(record), _kinematics(record)
+    components = _score_components(record, steps, kinematics)
+    early = record.first(PDMS_STEPS)
+    early_components = _score_components(early, steps.first(PDMS_STEPS), _kinematics(early))
     multiplied = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
     nuplan = math.prod(components[name] for name in multiplied if math.isfinite(components[name]))
     # NAVSIM: a collision with a standing object costs half, and the driving direction has weight 0
     area = early_components["drivable_area"]
     pdms = early_components["no_at_fault_collision"] * (1.0 if math.isnan(area) else area)
-    jerk = _kinematics(record).jerk
+    jerk = kinematics.jerk
     collisions, faults = record.collisions, [collision.at_fault for collision in record.collisions]
     route_length_m = float(record.route.progress(record.route.points[-1:])[0]) if len(record.route) else math.nan
     return PlannerScores(
@@ -103,8 +106,8 @@ def score_planner(record: Record) -> PlannerScores:
         at_fault_collision_rate=float(any(faults)),
         hit_rate=float(not all(faults)),
         red_light_rate=float(passes_red_light(record.scene, record.agent_motion[:, :2])),
-        least_ttc_s=least_time_to_collision(record),
-        off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(off_road(record).max())),
+        least_ttc_s=float(steps.time_to_collision_s.min()),
+        off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(steps.off_road_m.max())),
         route_completion=_gained(record.route, record.agent_motion) / route_length_m if route_length_m else math.nan,
         speed_change_mps=max((collision.speed_change_mps for collision in collisions), default=0.0),
         mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
@@ -130,19 +133,38 @@ def missing_scores(record: Record) -> dict[str, str]:
     return reasons
 
 
-def _score_components(record: Record) -> dict[str, float]:
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Measures of each step, which several scores share."""
+
+    off_road_m: Float[np.ndarray, "T1"]
+    lane_angle: Float[np.ndarray, "T1"]
+    limit_mps: Float[np.ndarray, "T1"]
+    time_to_collision_s: Float[np.ndarray, "T1"]
+
+    def first(self, num_steps: int) -> "_Steps":
+        """Measures of the first steps alone."""
+        return _Steps(*(getattr(self, field.name)[: num_steps + 1] for field in fields(self)))
+
+
+def _measure_steps(record: Record) -> _Steps:
+    angle, limit, _ = _lane_headings(record)
+    return _Steps(off_road(record), angle, limit, compute_times_to_collision(record))
+
+
+def _score_components(record: Record, steps: _Steps, kinematics: "_Kinematics") -> dict[str, float]:
     """The eight parts of the score."""
     missing = missing_scores(record)
     ratio = math.nan if "progress" in missing else _progress_ratio(record)
     components = {
         "no_at_fault_collision": _collision_score(record),
-        "drivable_area": float((off_road(record) < OUTSIDE_M).all()),
+        "drivable_area": float((steps.off_road_m < OUTSIDE_M).all()),
         "making_progress": math.nan if math.isnan(ratio) else float(ratio >= MAKING_PROGRESS),
-        "driving_direction": _direction_score(record),
+        "driving_direction": _direction_score(record, steps.lane_angle),
         "progress": ratio,
-        "time_to_collision": float(least_time_to_collision(record) >= TTC_LEAST_S),
-        "speed_limit": _speed_score(record),
-        "comfort": _comfort(record),
+        "time_to_collision": float(steps.time_to_collision_s.min() >= TTC_LEAST_S),
+        "speed_limit": _speed_score(record, steps.limit_mps),
+        "comfort": _comfort(kinematics),
     }
     return {name: math.nan if name in missing else value for name, value in components.items()}
 
@@ -216,8 +238,7 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
     return angle, limit, junction
 
 
-def _direction_score(record: Record) -> float:
-    angle, _, _ = _lane_headings(record)
+def _direction_score(record: Record, angle: Float[np.ndarray, "T1"]) -> float:
     step = np.linalg.norm(np.diff(record.agent_motion[:, :2], axis=0), axis=1)
     against = np.where(np.nan_to_num(angle[1:]) > np.pi / 2, step, 0.0)
     window = min(WRONG_WAY_STEPS, len(against))
@@ -225,15 +246,14 @@ def _direction_score(record: Record) -> float:
     return 1.0 if max_against < WRONG_WAY_M[0] else 0.5 if max_against < WRONG_WAY_M[1] else 0.0
 
 
-def _speed_score(record: Record) -> float:
-    _, limit, _ = _lane_headings(record)
+def _speed_score(record: Record, limit: Float[np.ndarray, "T1"]) -> float:
     speed = np.linalg.norm(record.agent_motion[:, 3:], axis=1)
     over = np.where(limit > 0, np.maximum(speed - limit, 0.0), 0.0)[1:]
     return max(0.0, 1.0 - float(over.mean()) / OVER_SPEED_MPS) if len(over) else 1.0
 
 
-def least_time_to_collision(record: Record) -> float:
-    """Least time until a box is met at constant speeds and headings, s; at most 3.
+def compute_times_to_collision(record: Record) -> Float[np.ndarray, "T1"]:
+    """Time from each step until a box is met at constant speeds and headings, s; at most 3.
 
     Tracks ahead and crossing tracks count. Tracks beside the agent count only while the agent is not in a single lane,
     or is in a junction; tracks behind, and tracks already touched, never count.
@@ -269,7 +289,9 @@ def least_time_to_collision(record: Record) -> float:
     # tracks that overlap at the start of the episode, such as a stroller and its pusher, are in no danger of it
     overlapping = np.isin(agents, agents[(steps == 0) & meets[:, 0]])
     meets &= ~overlapping[:, None]
-    return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else TTC_HORIZON_S
+    times = np.full(record.steps + 1, TTC_HORIZON_S)
+    np.minimum.at(times, steps, np.where(meets.any(1), time[meets.argmax(1)], TTC_HORIZON_S))
+    return times
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,11 +331,16 @@ def _smooth(
     values: Float[np.ndarray, "t *c"], window: int, *, order: int, derivative: int
 ) -> Float[np.ndarray, "t *c"]:
     """Derivative of values over the steps by the Savitzky-Golay filter."""
-    return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=STEP_S, axis=0))
+    return _build_filter(len(values), window, order, derivative) @ values
 
 
-def _comfort(record: Record) -> float:
-    motion = _kinematics(record)
+@lru_cache(maxsize=32)
+def _build_filter(count: int, window: int, order: int, derivative: int) -> Float[np.ndarray, "t t"]:
+    """The filter as a matrix: it is linear, and to fit its ends takes longer than to apply it."""
+    return np.asarray(savgol_filter(np.eye(count), window, order, deriv=derivative, delta=STEP_S, axis=0))
+
+
+def _comfort(motion: _Kinematics) -> float:
     if not len(motion.jerk):
         return math.nan
     low, high = ACCELERATION

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, Outcome
@@ -80,7 +81,7 @@ def describe_start(episode: Episode, state: EpisodeState, row: int, source: Sour
         "step": 0,
         "route": episode.atlas.routes[row].source,
         "model": source.fingerprint,
-        "lights_held": has_frozen_lights(episode, state, row),
+        "lights_held": bool(has_frozen_lights(episode, state)[row]),
         "logged": logged,
     }
 
@@ -94,24 +95,47 @@ def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: 
         outcome: Rewards and ends that the action led to.
         row: Index of the agent among the planner-driven agents [M].
     """
-    note: dict[str, Any] = {
-        "step": state.world.step,
-        "terms": {name: float(value[row]) for name, value in outcome.terms.items()},
-        "clipped": bool(outcome.is_clipped[row]),
-        "lights_held": has_frozen_lights(episode, state, row),
-    }
+    note = pick_row(describe_steps(episode, state, outcome), row)
     if outcome.terminated[row] or outcome.truncated[row]:
         note["result"] = Result(build_record(episode, state, row))
     return note
 
 
-def has_frozen_lights(episode: Episode, state: EpisodeState, row: int) -> bool:
+def describe_steps(episode: Episode, state: EpisodeState, outcome: Outcome) -> dict[str, Any]:
+    """Information of all agents after an action, in arrays [M].
+
+    Args:
+        episode: Episode that the agents drive in.
+        state: State of the episode after the action.
+        outcome: Rewards and ends that the action led to.
+    """
+    return {
+        "step": np.full(episode.num_agents, state.world.step),
+        "terms": outcome.terms,
+        "clipped": outcome.is_clipped,
+        "lights_held": has_frozen_lights(episode, state),
+    }
+
+
+def pick_row(columns: dict[str, Any], row: int) -> dict[str, Any]:
+    """Numbers of an agent by name, from arrays of all agents.
+
+    Args:
+        columns: Arrays by name, or dictionaries of arrays.
+        row: Index of the agent among the planner-driven agents [M].
+    """
+    return {
+        name: pick_row(column, row) if isinstance(column, dict) else column[row].item()
+        for name, column in columns.items()
+    }
+
+
+def has_frozen_lights(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
     """True where lights keep the last state as the log has no further states.
 
     Args:
-        episode: Episode that the agent drives in.
+        episode: Episode that the agents drive in.
         state: Present state of the episode.
-        row: Index of the agent among the planner-driven agents [M].
     """
-    lights = episode.world.scenes[episode.world.actors[row][0]].lights
-    return 0 <= lights.last_observed < len(state.world.track) - 1
+    last_observed = episode.last_light_step
+    return (last_observed >= 0) & (last_observed < len(state.world.track) - 1)

@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Bool, Int64, Shaped
 
 from rlftsim.envs.contact import Collision, lane_search
-from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
+from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS, compute_times_to_collision
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
 from rlftsim.realism import METRIC_2025, MetricConfig, SimulatedStates, score
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import compute_distance_to_road_edge
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, ObjectType, Scenario, cached_on_scenario
 from rlftsim.viewer.scene import compute_overlap
 
 RISKY_TTC_S = 1.0
@@ -75,7 +75,7 @@ def score_traffic(record: Record) -> TrafficScores:
     tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
     return TrafficScores(
         ego_contacts=float(len(record.collisions)),
-        risky_approach_rate=float(least_time_to_collision(record) < RISKY_TTC_S),
+        risky_approach_rate=float(compute_times_to_collision(record).min() < RISKY_TTC_S),
         others_collision_rate=_rate(overlaps, is_traffic),
         others_offroad_rate=_rate(_leaves_road(record), is_vehicle & has_edges),
         others_wrong_way_rate=_rate(_drives_against(record, is_vehicle), is_vehicle & has_lanes),
@@ -146,6 +146,11 @@ class _WithoutEgo(Scenario):
         return rows[np.argsort(self.tracks.object_id[rows], kind="stable")]
 
 
+@cached_on_scenario
+def _leave_out_ego(scenario: Scenario) -> _WithoutEgo:
+    return _WithoutEgo(**{field.name: getattr(scenario, field.name) for field in fields(Scenario)})
+
+
 def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
     """Realism meta-metric of the agents to predict, the ego left out, over rollouts of a scenario.
 
@@ -157,7 +162,7 @@ def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = ME
         config: Version of the metric; 2025 by default.
     """
     scene = records[0].scene
-    scenario = _WithoutEgo(**{field.name: getattr(scene.scenario, field.name) for field in fields(Scenario)})
+    scenario = _leave_out_ego(scene.scenario)
     has_all_steps = all(record.steps == FUTURE_STEPS for record in records)
     if not (scenario.has_evaluated_future and has_all_steps) or road_edges(scene.scenario) is None:
         return float("nan")

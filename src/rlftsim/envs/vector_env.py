@@ -13,7 +13,15 @@ from jaxtyping import Bool, Int64
 from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
+from rlftsim.envs.resets import (
+    build_config,
+    choose_scenario,
+    describe_start,
+    describe_step,
+    describe_steps,
+    draw_seed,
+    pick_row,
+)
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.errors import ConfigError, in_short, whole_number
@@ -102,7 +110,7 @@ class EgoVectorEnv(VectorEnv):
             ConfigError: an unknown option or scenario.
         """
         observation, notes = self.reset_slots(seed, options)
-        return observation, self._join_infos(notes)
+        return observation, self._join_infos(notes, {})
 
     def reset_slots(
         self, seed: int | Sequence[int | None] | None, options: dict[str, Any] | None = None
@@ -147,8 +155,11 @@ class EgoVectorEnv(VectorEnv):
         Raises:
             ConfigError: as `step_slots`.
         """
-        observation, rewards, terminated, truncated, notes = self.step_slots(actions)
-        return observation, rewards, terminated, truncated, self._join_infos(notes)
+        *results, steps, notes = self._step(actions)
+        infos: dict[str, Any] = {}
+        for columns, rows, slots in steps:
+            self._add_columns(infos, columns, rows, slots)
+        return *results, self._join_infos(notes, infos)
 
     def step_slots(
         self, actions: Any
@@ -162,6 +173,15 @@ class EgoVectorEnv(VectorEnv):
             ConfigError: before `reset`, or an action with a NaN or of a wrong shape; with autoreset disabled a slot
                 whose episode is over.
         """
+        *results, steps, notes = self._step(actions)
+        for columns, rows, slots in steps:
+            for row, slot in zip(rows, slots):
+                notes[slot] = pick_row(columns, int(row))
+        return *results, notes
+
+    def _step(self, actions: Any) -> tuple[Any, ...]:
+        """As `step_slots`; before the infos of slots that begin or end an episode stand those of all others, in arrays:
+        columns by name, and rows and slots that have them."""
         if not self._groups:
             raise ConfigError("these environments have no episodes yet: call reset() first.")
         controls = self.source.controls
@@ -179,6 +199,7 @@ class EgoVectorEnv(VectorEnv):
             self._reset(over, {}, notes)
             begun = self._groups[-1:]
         # 2. all others act, a group at a time
+        steps: list[tuple[dict[str, Any], np.ndarray, np.ndarray]] = []
         for group in self._groups:
             if group in begun:
                 continue
@@ -188,8 +209,11 @@ class EgoVectorEnv(VectorEnv):
             group.state, outcome = advance(group.episode, group.state, action)
             rewards[slots] = outcome.reward[group.live]
             terminated[slots], truncated[slots] = outcome.terminated[group.live], outcome.truncated[group.live]
-            for row, slot in zip(group.live, slots):
+            is_over = terminated[slots] | truncated[slots]
+            for row, slot in zip(group.live[is_over], slots[is_over]):
                 notes[slot] = describe_step(group.episode, group.state, outcome, int(row))
+            columns = describe_steps(group.episode, group.state, outcome)
+            steps.append((columns, group.live[~is_over], slots[~is_over]))
         self._over = terminated | truncated
         # 3. the same step resets at once and hands over the last observation beside the first
         ended = np.flatnonzero(self._over)
@@ -200,11 +224,19 @@ class EgoVectorEnv(VectorEnv):
                 is_dict = isinstance(last, dict)
                 final_observation = {name: values[slot] for name, values in last.items()} if is_dict else last[slot]
                 notes[slot] |= {"final_obs": final_observation, "final_info": final[slot]}
-        return self._observe(), rewards, terminated, truncated, notes
+        return self._observe(), rewards, terminated, truncated, steps, notes
 
-    def _join_infos(self, notes: list[dict[str, Any]]) -> dict[str, Any]:
-        """Infos of all slots in Gymnasium's form for vectors."""
-        infos: dict[str, Any] = {}
+    def _add_columns(self, infos: dict[str, Any], columns: dict[str, Any], rows: np.ndarray, slots: np.ndarray) -> None:
+        """Add infos of some rows of a group in Gymnasium's form for vectors, as `_add_info` does for a slot."""
+        for name, column in columns.items():
+            if isinstance(column, dict):
+                self._add_columns(infos.setdefault(name, {}), column, rows, slots)
+            else:
+                infos.setdefault(name, np.zeros(self.num_envs, column.dtype))[slots] = column[rows]
+            infos.setdefault(f"_{name}", np.zeros(self.num_envs, bool))[slots] = True
+
+    def _join_infos(self, notes: list[dict[str, Any]], infos: dict[str, Any]) -> dict[str, Any]:
+        """Infos of all slots in Gymnasium's form for vectors, added to others."""
         for slot, note in enumerate(notes):
             infos = self._add_info(infos, note, slot)
         return infos

@@ -16,6 +16,7 @@ seconds. Motion: x, y, heading, vx, vy.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -84,6 +85,18 @@ class World:
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
     """True = heights count in the scene, see `levels`."""
+
+    @cached_property
+    def agents(self) -> dict[Driver, tuple[np.ndarray, np.ndarray]]:
+        """Scenes and agents that each driver moves, as two arrays."""
+        scene, agent = np.nonzero(self.mask)
+        drivers = self.drivers[scene, agent]
+        return {driver: (scene[drivers == driver], agent[drivers == driver]) for driver in Driver}
+
+    @cached_property
+    def logged_steps(self) -> Float[np.ndarray, "91 B A 5"]:
+        """`logged`, one step after the other."""
+        return np.ascontiguousarray(np.moveaxis(self.logged, 2, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +257,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     """
     block, dice = state.block, state.dice
     following = len(state.track)  # step of the log's time that is being computed
-    motion = world.logged[:, :, min(following, world.logged.shape[2] - 1)].copy()  # replayed agents
+    motion = world.logged_steps[min(following, TOTAL_STEPS - 1)].copy()  # replayed agents
     previous = state.motion
     # 1. agents of the policy, and those that keep their velocity
     if block is not None:
@@ -255,18 +268,17 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         assert block.poses is not None
         poses = block.poses[:, :, state.step % world.policy.steps_per_decision]
         velocity = (poses[..., :2] - previous[..., :2]) / STEP_S
-        follows = world.drivers == Driver.POLICY
+        follows = world.agents[Driver.POLICY]
         motion[follows] = np.concatenate([poses, velocity], -1)[follows]
-    coasts = world.drivers == Driver.CONSTANT_VELOCITY
-    if coasts.any():
+    coasts = world.agents[Driver.CONSTANT_VELOCITY]
+    if len(coasts[0]):
         motion[coasts] = previous[coasts]
-        motion[coasts, :2] += STEP_S * previous[coasts, 3:]
+        motion[(*coasts, slice(2))] += STEP_S * previous[coasts][:, 3:]
     # 2. IDM-driven vehicles
-    idm_states = state.idm_states
-    driven = world.drivers == Driver.IDM
-    motion[driven] = previous[driven]
-    motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
-    if any(len(lines.agents) for lines in world.lines):
+    idm_states, driven = state.idm_states, world.agents[Driver.IDM]
+    if len(driven[0]):
+        motion[driven] = previous[driven]
+        motion[(*driven, slice(3, 5))] = 0.0  # parked ones stay; those with a line move below
         present = world.is_present[:, :, following - 1]
         moved_states = []
         for b, (scene, lines) in enumerate(zip(world.scenes, world.lines)):

@@ -23,6 +23,8 @@ from rlftsim.realism.rounding import compute_largest_square, compute_sqrt
 
 CHUNK_SEGMENTS = 16
 LISTED_CHUNKS = 12
+FEW_PAIRS = 1024
+"""Up to so many pairs of a point and a chunk are searched at once, as lists would cost more than they save."""
 PADDING_COORDINATE = 1e15
 """Coordinate of padding: never nearest, and its square is still a float32."""
 _KEY_SHIFT = 32
@@ -216,6 +218,9 @@ class _Search:
         points, axes = groups.flatten(0, 1), groups.permute(2, 0, 1)
         low, high, first_chunk = segments.select_scenarios(scenario)
         num_chunks = low.shape[-1]
+        if scenario is None and len(points) * num_chunks <= FEW_PAIRS:
+            row, chunk = torch.ones(len(points), num_chunks, device=points.device).nonzero().unbind(-1)
+            return self.search_chunks(points, row, chunk).view(len(points), num_chunks).amin(1)
         num_listed = min(LISTED_CHUNKS, num_chunks)
         group_box = (axes.amin(-1)[..., None], axes.amax(-1)[..., None])
         group_bound = _squared_box_distance(group_box, (low, high), segments.axis_scale)  # [G, M]
