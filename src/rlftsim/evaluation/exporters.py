@@ -178,7 +178,7 @@ def read_rollouts(entry: RolloutEntry, scenario: Scenario) -> SimulatedStates:
     # Files of an earlier call may be damaged or of an older data set.
     way_out = "remove it, then run the same command again."
     try:
-        states = read_states(entry)
+        states = read_states(entry, None)
     except DataError as error:
         raise DataError(f"{str(error).rstrip('.')}: {way_out}") from None
     if not np.isin(scenario.tracks.object_id[scenario.simulated_indices], states.object_id).all():

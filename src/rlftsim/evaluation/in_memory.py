@@ -23,7 +23,7 @@ from rlftsim.scenario.types import CURRENT_STEP
 
 
 def simulate_in_memory(
-    policy: Policy, batch: ScenarioBatch, num_rollouts: int, seed: int, sampling: Sampling, goals: Any
+    policy: Policy, batch: ScenarioBatch, num_rollouts: int, seed: int, num_steps: int, sampling: Sampling, goals: Any
 ) -> Rollouts:
     """Rollouts of a batch with their provenance, simulated scenario by scenario.
 
@@ -32,6 +32,7 @@ def simulate_in_memory(
         batch: Scenarios to continue, on the policy's device.
         num_rollouts: Number N of rollouts of each scenario.
         seed: Seed of the rollouts.
+        num_steps: Number of simulated steps of 0.1 s.
         sampling: Temperature and truncation of the decisions.
         goals: Points, or goals of the whole batch, as for `rs.simulate`; None = goal-free.
 
@@ -57,8 +58,8 @@ def simulate_in_memory(
             scenario_goals = replace(placed, position=position, goal_mask=mask) if has_goals[row] else None
             simulated.append(
                 simulate(
-                    policy, scenario_batch, num_rollouts=num_rollouts, seed=seed, goals=scenario_goals,
-                    sampling=sampling,
+                    policy, scenario_batch, num_rollouts=num_rollouts, seed=seed, num_steps=num_steps,
+                    goals=scenario_goals, sampling=sampling,
                 )
             )  # fmt: skip
             advance()
@@ -142,8 +143,10 @@ def score_in_memory(batch: ScenarioBatch, rollouts: Rollouts, metric: str, *, is
     states, config = states_of_rollouts(batch, rollouts), metric_by_name(metric)
     for scenario, simulated in zip(batch.scenarios, states):
         simulated.check_finite(scenario.scenario_id)
+    scored = score(batch.scenarios[0], states[0], config) if is_single else score_batch(batch.scenarios, states, config)
+    for scenario, simulated in zip(batch.scenarios, states):
         warn_of_doubts(scenario, simulated)
-    return score(batch.scenarios[0], states[0], config) if is_single else score_batch(batch.scenarios, states, config)
+    return scored
 
 
 def _match_batch(batch: ScenarioBatch, rollouts: Rollouts) -> ScenarioBatch:

@@ -8,7 +8,15 @@ import torch
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.files import write_atomically
 from rlftsim.realism import SimulatedStates, compute_features, scenario_log
-from rlftsim.scenario.types import HISTORY_STEPS, LANE_TYPES, ROAD_EDGE_TYPES, LightState, ObjectType, Scenario
+from rlftsim.scenario.types import (
+    FUTURE_STEPS,
+    HISTORY_STEPS,
+    LANE_TYPES,
+    ROAD_EDGE_TYPES,
+    LightState,
+    ObjectType,
+    Scenario,
+)
 
 MAX_ROLLOUTS = 8
 """Rollouts in a recording."""
@@ -94,7 +102,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
 
 def _measure_events(scenario: Scenario, states: SimulatedStates) -> dict[str, np.ndarray]:
     """Fraction of evaluated agents that collide, or are off the road, at each step of the first rollouts, [N, T]."""
-    if not scenario.has_evaluated_future:
+    if not scenario.has_evaluated_future or states.x.shape[-1] != FUTURE_STEPS:
         return {}
     features = compute_features(scenario_log(scenario, states.device, missing_map="neutral"), states)
     events = {"collision": features.collision, "off_road": features.offroad}

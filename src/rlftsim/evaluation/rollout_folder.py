@@ -37,6 +37,7 @@ class Simulation:
     scenario_ids: Sequence[str]
     """In the order of the work."""
     num_rollouts: int
+    num_steps: int
     seed: int
     sampling: Sampling
     goals: GoalsFile
@@ -51,6 +52,7 @@ class Simulation:
             "data": self.dataset.fingerprint,
             "seed": self.seed,
             "num_rollouts": self.num_rollouts,
+            "num_steps": self.num_steps,
             "sampling": asdict(self.sampling),
         }
         entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
@@ -73,7 +75,7 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
     """
     check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
     identity = simulation.describe()
-    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_validate_file, simulation.num_rollouts))
+    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_validate_file, simulation))
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
@@ -87,15 +89,15 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
     return paths
 
 
-def _validate_file(num_rollouts: int, path: Path) -> Path:
+def _validate_file(simulation: Simulation, path: Path) -> Path:
     """The file of a scenario; checksums, types and shapes of its arrays are right.
 
     Raises:
         DataError: Damaged file, or other rollouts than those of the scenario that the file is named after.
     """
-    states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == path.stem]
-    if [len(rollouts.x) for rollouts in states] != [num_rollouts]:
-        raise DataError(f"{path}: it holds other rollouts than {num_rollouts} of its scenario.")
+    entries = [entry for entry in find_rollouts(path) if entry.scenario_id == path.stem]
+    if [len(read_states(entry, simulation.num_steps).x) for entry in entries] != [simulation.num_rollouts]:
+        raise DataError(f"{path}: it holds other rollouts than {simulation.num_rollouts} of its scenario.")
     return path
 
 
@@ -109,7 +111,8 @@ def _simulate_scenario(
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
-        sampling=simulation.sampling, goals=goals_of_batch(entries, batch) if entries else None,
+        num_steps=simulation.num_steps, sampling=simulation.sampling,
+        goals=goals_of_batch(entries, batch) if entries else None,
     )  # fmt: skip
     [path] = write_rollouts(out, batch, rollouts)
     advance(1)

@@ -26,8 +26,8 @@ NUM_HISTORY_STEPS = 2
 class SimulatedStates:
     """Future states of a scenario's simulated agents in N rollouts, world frame, float32, on a single device.
 
-    Every agent exists at all T = 80 steps, or T = 91 of a generated scene. Agents may come in any order, named by
-    `object_id`.
+    Every agent exists at all T steps: 80 where they are scored, 91 of a generated scene. Agents may come in any order,
+    named by `object_id`.
     """
 
     object_id: Int[np.ndarray, "A"]
@@ -43,7 +43,7 @@ class SimulatedStates:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
-        num_steps = self.challenge.num_steps
+        num_steps = self.x.shape[-1] if self.size is None else SCENARIO_GEN.num_steps
         expected_shape = (*self.x.shape[:1], len(self.object_id), num_steps)
         if self.size is not None and tuple(self.size.shape) != (*expected_shape, 3):
             raise DataError(f"Sizes of generated agents must be {[*expected_shape, 3]}, got {list(self.size.shape)}.")
@@ -317,10 +317,10 @@ def join_history(
     Raises:
         DataError: The agents of the rollouts are not those of the scenario, or the steps those of another challenge.
     """
-    if states.challenge != agents.challenge:
+    if states.challenge != agents.challenge or states.x.shape[-1] != agents.challenge.num_steps:
         raise DataError(
             f"scenario {scenario_id}: {agents.challenge.title} scores {agents.challenge.num_steps} steps of an agent, "
-            f"and these rollouts have the {states.challenge.num_steps} of {states.challenge.title}: name a metric of "
+            f"and these rollouts have {states.x.shape[-1]} in the form of {states.challenge.title}: name a metric of "
             "that challenge; `rlftsim evaluate` makes the rollouts that its metric wants."
         )
     order = match_agents(agents.object_id, states.object_id, scenario_id)

@@ -18,12 +18,13 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, get_args, run
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64, Shaped
 
-from rlftsim.errors import DataError, in_short
+from rlftsim.errors import ConfigError, DataError, in_short
 from rlftsim.jobs.documents import MAX_NAME_BYTES
 
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
+MAX_SECONDS = 86_400.0
 TIME_TOLERANCE_S = STEP_S / 2
 """A timestamp may be so far from its multiple of 0.1 s: in 9 s the clocks of real logs drift by up to 0.022 s, and
 their steps differ by up to 0.011 s."""
@@ -31,6 +32,23 @@ HISTORY_STEPS = 11
 CURRENT_STEP = 10
 FUTURE_STEPS = 80
 TOTAL_STEPS = 91
+
+
+def count_steps(seconds: float) -> int:
+    """Number of steps of 0.1 s in a time.
+
+    Args:
+        seconds: Time in seconds, a multiple of 0.1 above zero.
+
+    Raises:
+        ConfigError: A time that is no such multiple.
+    """
+    steps = round(seconds / STEP_S) if 0 < seconds < MAX_SECONDS else 0
+    if steps < 1 or abs(steps * STEP_S - seconds) > 1e-6:
+        raise ConfigError(
+            f"seconds must be a multiple of {STEP_S:g} above 0 and below {MAX_SECONDS:g}, got {in_short(seconds)}."
+        )
+    return steps
 
 
 class ObjectType(IntEnum):

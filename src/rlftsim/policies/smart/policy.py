@@ -326,7 +326,8 @@ class SmartPolicy(SmartModel):
             if state.pending is None:
                 cache.features, cache.past = context.features[:, None].expand(*state.heading.shape, -1), past
             else:
-                past = past.last(self.config.history_tokens) if context.is_padded else past
+                if context.is_padded or past.row.shape[-1] >= 2 * self.config.history_tokens:
+                    past = past.last(self.config.history_tokens)  # no row looks farther back
                 view = decoder.look(context.scene, state.pending, past, padded=context.is_padded)
                 maps = None if torch.is_grad_enabled() else context.maps
                 rows, cache.past = decoder(context.scene, state.pending, past, view, state.goals, maps)
