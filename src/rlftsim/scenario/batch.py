@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, Scenario
 
 Frame = Literal["map", "world"]
 
@@ -58,6 +58,11 @@ class ScenarioBatch:
         """
         # added in float64, so that only the result is rounded
         return (position.double() + self.origin[:, None, None, None].to(position.device)).float()
+
+    def history(self) -> "ScenarioBatch":
+        """The same batch with tensors that end at the current step."""
+        names = ("position", "z", "heading", "velocity", "valid")
+        return replace(self, **{name: getattr(self, name)[:, :, :HISTORY_STEPS] for name in names})
 
     def to(self, device: torch.device | str) -> "ScenarioBatch":
         """The same batch on another device."""

@@ -124,7 +124,8 @@ class SmartPolicy(SmartModel):
 
     def encode(self, scenarios: ScenarioBatch) -> Context:
         """Map features, history tokens and decoder features, for goal-free agents."""
-        tokens = restart_at_log(self._tokenize(scenarios), scenarios, self.vocabulary)
+        past = scenarios.history()  # a minute of future would have to be tokenized
+        tokens = restart_at_log(self._tokenize(past), past, self.vocabulary)
         scene = self._build_scene(scenarios)
         history = self._logged_steps(tokens, slice(HISTORY_TOKENS))
         view = self.network.decoder.look(scene, history, None)
