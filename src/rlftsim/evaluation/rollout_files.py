@@ -161,6 +161,7 @@ def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
 
 def _states_of_npz(entry: RolloutEntry, num_steps: int | None) -> SimulatedStates:
     arrays = _read_npz(entry.file, _KEYS[1:])
+    valid = read_npz(entry.file, ("valid",), "write it again").get("valid")
     ids = arrays.pop("object_ids")
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise DataError(f"object_ids must be whole numbers [A], got {ids.dtype} {list(ids.shape)}.")
@@ -179,9 +180,12 @@ def _states_of_npz(entry: RolloutEntry, num_steps: int | None) -> SimulatedState
     if len(set(numbers)) > 1:
         text = ", ".join(map(str, numbers))
         raise DataError(f"x, y, z and heading hold {text} rollouts: there must be equally many.")
+    if valid is not None and (valid.dtype.kind != "b" or valid.shape != arrays["x"].shape):
+        raise DataError(f"valid must be true or false in the shape of x, got {valid.dtype} {list(valid.shape)}.")
     with np.errstate(over="ignore"):  # what becomes infinite is refused by name
         x, y, z, heading = (torch.from_numpy(np.ascontiguousarray(arrays[axis], np.float32)) for axis in AXES)
-    return SimulatedStates(ids.astype(np.int64), x, y, z, heading)
+    presence = None if valid is None else torch.from_numpy(valid)
+    return SimulatedStates(ids.astype(np.int64), x, y, z, heading, valid=presence)
 
 
 def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:

@@ -17,7 +17,9 @@ from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Runner
+from rlftsim.rollout.entries import identify_entries, load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.rollout.types import write_rollouts
@@ -43,6 +45,8 @@ class Simulation:
     goals: GoalsFile
     model: str
     """Name of the model, for people who read the description."""
+    entries: str | None = None
+    """Name or file of the model of who enters; None = nobody enters or leaves."""
 
     def describe(self) -> dict[str, Any]:
         """Values on which the rollouts depend, in types of JSON, and the name of the model, which may change."""
@@ -56,7 +60,8 @@ class Simulation:
             "sampling": asdict(self.sampling),
         }
         entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
-        return identity | ({"goals": entries} if entries else {})
+        entering = {} if self.entries is None else {"entries": identify_entries(self.entries)}
+        return identity | ({"goals": entries} if entries else {}) | entering
 
 
 def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> list[Path]:
@@ -107,12 +112,14 @@ def _simulate_scenario(
     """File with the rollouts of a scenario, written now; None where the work is being stopped."""
     if is_stopped():
         return None
-    batch = collate([simulation.dataset.by_id(scenario_id)]).to(get_device(simulation.policy))
+    scenario, name = simulation.dataset.by_id(scenario_id), simulation.entries
+    batch = collate([scenario if name is None else add_visitors(scenario)]).to(get_device(simulation.policy))
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
         num_steps=simulation.num_steps, sampling=simulation.sampling,
         goals=goals_of_batch(entries, batch) if entries else None,
+        entries=None if name is None else load_entries(name),
     )  # fmt: skip
     [path] = write_rollouts(out, batch, rollouts)
     advance(1)

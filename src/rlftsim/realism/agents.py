@@ -40,6 +40,8 @@ class SimulatedStates:
     """Number of identical rollouts behind each row: 32 equal rollouts are scored at the cost of a single rollout."""
     size: Float[Tensor, "N A T 3"] | None = None
     """Length, width, height of generated agents, m; None = agents go on from the log, with the sizes there."""
+    valid: Bool[Tensor, "N A T"] | None = None
+    """True = the agent is there, in a world that agents enter and leave, which is not scored; None = everybody is."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
@@ -56,6 +58,11 @@ class SimulatedStates:
                 )
         if self.repeat < 1 or expected_shape[0] < 1:
             raise DataError(f"At least one rollout is needed, got {expected_shape[0]} x repeat {self.repeat}.")
+
+    @property
+    def presence(self) -> Bool[Tensor, "N A T"]:
+        """True = the agent is there."""
+        return torch.ones_like(self.x, dtype=torch.bool) if self.valid is None else self.valid
 
     @property
     def challenge(self) -> Challenge:

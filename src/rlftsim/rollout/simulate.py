@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,12 +12,16 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
+from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.open_world import OpenWorld
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import FUTURE_STEPS, Scenarios
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, Scenarios
 
+RELIT_STEPS = 20
+"""After the metric's 8 s agents see the lights of the log, anew every 2 s; within these they see those of "now"."""
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]
 Observe = Callable[[Float[Tensor, "B N A t 3"]], None]
@@ -36,6 +41,7 @@ def simulate(
     sampling: Sampling = Sampling(),  # noqa: B008
     choose: Choose | None = None,
     force: Force | None = None,
+    entries: EntryModel | None = None,
     observe: Observe | None = None,
     may_be_nan: bool = False,
 ) -> Rollouts:
@@ -55,6 +61,8 @@ def simulate(
         choose: Function that picks decisions from a distribution, such as CAT-K's closest among the top K; None = draw.
         force: Function called before every advance with the state and the step that the decision starts at; may impose
             states on agents.
+        entries: Model of who enters, for a single scenario with visitors (`open_world.add_visitors`); agents leave,
+            too. Takes the place of `force`. None = nobody enters or leaves.
         observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error ends
             the simulation.
         may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
@@ -64,7 +72,7 @@ def simulate(
 
     Raises:
         ConfigError: There are no rollouts, the length of a decision does not divide the steps, or goals, which are due
-            after 8 s, in rollouts of another length.
+            after 8 s, in rollouts of another length; or entries that do not fit policy or batch, see `OpenWorld`.
         DataError: Log-probabilities are NaN, as with weights that are NaN; the scenario is named.
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
@@ -79,6 +87,8 @@ def simulate(
             f"goals are due after {FUTURE_STEPS} steps, not after {num_steps}: simulate 8 seconds, or leave goals out."
         )
     num_decisions = num_steps // stride
+    world = None if entries is None else OpenWorld(batch, rollout_ids, seed, stride, entries)
+    force = force if world is None else world.force
     goals = goals and goals.repeat(len(rollout_ids))
 
     # 1. noise depends on seed, scenario and rollout id alone
@@ -91,6 +101,8 @@ def simulate(
     draws = state.draws
     poses, decisions, log_probs, forced_states, masks = [], [], [], [], []
     for step, decision_noise in zip(range(0, num_steps, stride), noise):
+        if step >= FUTURE_STEPS and step % RELIT_STEPS == 0 and _changes_lights(batch, CURRENT_STEP + step):
+            context = policy.encode(replace(batch, light_step=CURRENT_STEP + step))
         distribution = policy.decide(context, state)
         arguments = (sampling, decision_noise)
         decision = choose(distribution, state, *arguments) if choose else distribution.sample(*arguments)
@@ -121,7 +133,15 @@ def simulate(
             "again if they diverged, or leave out a scenario with extreme values."
         )
     decision = torch.stack(decisions, dim=3)
-    return Rollouts(path[..., :2], path[..., 2], decision, mask, log_prob, draws=draws, goals=goals, forced=all_forced)
+    valid = None if world is None else world.valid.to(batch.device)
+    return Rollouts(
+        path[..., :2], path[..., 2], decision, mask, log_prob, draws=draws, goals=goals, forced=all_forced, valid=valid
+    )
+
+
+def _changes_lights(batch: ScenarioBatch, step: int) -> bool:
+    """True where a log still has traffic lights at a step, which are no more than a signal plan to the agents."""
+    return any(len(s.lights.step) and step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
 
 
 def _draw_decision_noise(

@@ -39,6 +39,8 @@ class ScenarioBatch:
     """Length, width, height at the current step."""
     valid: Bool[Tensor, "B A S"]
     frame: Frame = "map"
+    light_step: int = CURRENT_STEP
+    """Step of the log whose traffic lights are seen; the last one where a log ends before."""
 
     @property
     def num_scenarios(self) -> int:

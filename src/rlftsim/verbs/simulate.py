@@ -14,6 +14,7 @@ from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
 from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work, check_jobs, choose_runner
 from rlftsim.policies.registry import with_guidance
+from rlftsim.rollout.entries import load_entries
 from rlftsim.rollout.policy import Sampling, frozen_copy, get_device, is_training
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -30,14 +31,14 @@ IN_FILES = ("scenario", "limit", "goal", "picture", "export", "jobs", "work")
 @overload
 def simulate(
     policy: Model, scenarios: Data, *, num_rollouts: int = ..., seed: int = ..., seconds: float = ...,
-    goals: GoalPoints | None = ..., sampling: Sampling | None = ..., out: None = ..., split: str = ...,
-    guidance_scale: float = ..., device: Device = ...,
+    entries: str | None = ..., goals: GoalPoints | None = ..., sampling: Sampling | None = ..., out: None = ...,
+    split: str = ..., guidance_scale: float = ..., device: Device = ...,
 ) -> Rollouts: ...  # fmt: skip
 @overload
 def simulate(
     policy: Model, scenarios: Data, *, num_rollouts: int = ..., seed: int = ..., seconds: float = ...,
-    goals: GoalPoints | None = ..., sampling: Sampling | None = ..., out: File, split: str = ...,
-    scenario: list[str] | None = ..., limit: int | None = ..., goal: tuple[str, ...] = ...,
+    entries: str | None = ..., goals: GoalPoints | None = ..., sampling: Sampling | None = ..., out: File,
+    split: str = ..., scenario: list[str] | None = ..., limit: int | None = ..., goal: tuple[str, ...] = ...,
     guidance_scale: float = ..., picture: bool = ..., export: tuple[str, ...] = ..., device: Device = ...,
     jobs: int = ..., work: Work = ...,
 ) -> list[Path]: ...  # fmt: skip
@@ -49,6 +50,7 @@ def simulate(
     num_rollouts: int = 32,
     seed: int = 0,
     seconds: float = 8.0,
+    entries: str | None = None,
     goals: GoalPoints | None = None,
     sampling: Sampling | None = None,
     out: File | None = None,
@@ -82,6 +84,9 @@ def simulate(
         seed: Seed of the rollouts. The same seed gives the same rollouts.
         seconds: Length of the rollouts. Scores, goals and submissions need the 8 of the metric; a longer rollout
             begins with the same states as one of 8 s.
+        entries: Who enters where lanes cross the border of a region around the ego: "none", "fixed-rate", a file that
+            `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents beyond the border leave. Left out,
+            the agents of "now" are there all the time.
         goals: Goals file (docs/goals.md). Without --scenario only its scenarios are simulated. In Python, for rollouts
             in memory, points in meters in the world frame, {object_id: (x, y)} or {scenario_id: {object_id: (x, y)}},
             or goals of the whole batch as tensors.
@@ -115,7 +120,7 @@ def simulate(
             numbers.
     """
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed, 0)
-    num_steps = count_steps(seconds)
+    num_steps, entry_model = count_steps(seconds), None if entries is None else load_entries(entries)
     limit = None if limit is None else whole_number("limit", limit, 1)
     sampling = to_sampling(sampling)
     if out is None:
@@ -131,7 +136,7 @@ def simulate(
     if out is None:
         named = to_scenarios(scenarios, split) if isinstance(scenarios, str | PathLike) else scenarios
         return simulate_in_memory(
-            model, to_batch(named, get_device(model)), num_rollouts, seed, num_steps, sampling, goals
+            model, to_batch(named, get_device(model)), num_rollouts, seed, num_steps, sampling, goals, entry_model
         )
     check_jobs(jobs, get_device(model), "jobs")
     if not isinstance(scenarios, str | PathLike | ScenarioDataset) or not isinstance(goals, str | PathLike | None):
@@ -143,7 +148,7 @@ def simulate(
     ids = list(dict.fromkeys(scenario or file.scenario_ids or dataset.scenario_ids))[:limit]
     check_scenarios(ids, file, dataset, str(dataset.folder if scenarios is dataset else scenarios), bool(scenario))
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(ids))
-    simulation = Simulation(model, dataset, tuple(ids), num_rollouts, num_steps, seed, sampling, file, name)
+    simulation = Simulation(model, dataset, tuple(ids), num_rollouts, num_steps, seed, sampling, file, name, entries)
     paths = simulate_folder(simulation, Path(out), runner=runner)
     # also of rollouts that an earlier call has written
     report_rollouts(Path(out), dataset, ids, file, picture=picture, exporters=exporters)

@@ -21,7 +21,7 @@ from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, EncodedGoals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import Past, Scene, View, mask_positions
-from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions
+from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere
 from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -190,15 +190,17 @@ class SmartPolicy(SmartModel):
             decision: Id of the token that each agent takes, within the agent's class.
             forced: States [B, N, A, 5] imposed from outside; only agents with five valid states are imposed.
         """
+        start, is_elsewhere = (state.position, state.heading), None
+        if forced is not None:
+            start, is_elsewhere = begin_elsewhere(start, forced)
         poses, decision = apply_decisions(
-            decision, state.position, state.heading, context.object_type, self.vocabulary, forced,
-            catk_compat=self.config.catk_compat,
-        )  # fmt: skip
+            decision, *start, context.object_type, self.vocabulary, forced, catk_compat=self.config.catk_compat
+        )
         position, heading = poses[..., -1, :2], poses[..., -1, 2]
         block = TokenSteps(
             position=position[..., None, :],
             heading=heading[..., None],
-            motion=(position - state.position)[..., None, :],
+            motion=(position - start[0])[..., None, :],
             token_id=decision[..., None],
             valid=context.agent_mask[:, None, :, None].expand(*heading.shape, 1),
         )
@@ -208,6 +210,8 @@ class SmartPolicy(SmartModel):
             past = state.cache.past
         elif state.pending is not None:
             pending = state.pending.append(block)
+        if is_elsewhere is not None:
+            past = replace(past, row=torch.where(is_elsewhere[..., None], -1, past.row))
         num_decisions = state.num_decisions + 1
         return State(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
