@@ -87,6 +87,8 @@ class Options:
     """The public code makes rollouts one after the other: so many are timed, for all of them."""
     full_demo: bool = False
     """The whole demo, once, instead of its smallest size."""
+    dry_run: bool = False
+    """Rows of the GPU on the CPU, a scenario and two rollouts each, so that a lent machine loses no time on a mistake."""
 
     def checkout(self, side: Side) -> Path:
         return self.old if side == "old" and self.old else HERE.parent
@@ -112,6 +114,8 @@ def environment(options: Options, side: Side) -> dict[str, str]:
 def job_command(options: Options, side: Side, job: Job) -> list[str]:
     """Command line of a job's process."""
     job = replace(job, inputs=str(options.inputs), shared=job.shared or str(options.shared.resolve()))
+    if options.dry_run and job.device == "cuda":
+        job = replace(job, device="cpu", scenarios=job.scenarios[:1], num_rollouts=2, batch_size=1)
     if side != "public":
         return [sys.executable, str(HERE / "speed_jobs.py"), job.write()]
     job = replace(job, checkout=str(options.catk), timed_rollouts=options.public_rollouts)
@@ -176,6 +180,8 @@ class Measurement:
     measure: Callable[[Options], Samples]
     shown: tuple[str, ...] = ("seconds", "peak_mib", "search_share")
     needs: Literal["", "real scenarios", "GPU", "public code"] = ""
+    is_variant: bool = False
+    """A dry run leaves it out: it differs from another row in size or precision alone."""
 
     def missing(self, options: Options) -> str:
         """Why it cannot be measured."""
@@ -183,7 +189,7 @@ class Measurement:
             "": lambda: True,
             "real scenarios": lambda: options.womd,
             "public code": lambda: options.sides(("public",)),
-            "GPU": has_gpu,
+            "GPU": lambda: options.dry_run or has_gpu(),
         }
         return "" if there[self.needs]() else f"no {self.needs}"
 
@@ -318,9 +324,21 @@ MEASUREMENTS = (
     Measurement("metric", "metric, 32 rollouts of bada; official evaluator", metric),
     Measurement("demo", "demo, slowest process of each stage", demo, STAGES),
     Measurement("evaluation", f"evaluation of {NUM_EVALUATED} real scenarios, tiny; public code and official evaluator", evaluation, EVALUATED, "real scenarios"),
-    Measurement("gpu", "rollouts, tiny, A", take_turns(Job("rollouts", scenarios=("A",), device="cuda")), needs="GPU"),
-    Measurement("gpu", "rollouts, tiny, 16 scenarios", take_turns(Job("rollouts", scenarios=("A", "B") * 8, device="cuda")), needs="GPU"),
     Measurement("gpu", "metric, 16 scenarios", take_turns(Job("metric", scenarios=("bada", "637f") * 8, device="cuda"), OURS), needs="GPU"),
+    *(
+        Measurement(
+            "gpu", f"{name}, {precision}", take_turns(replace(job, device="cuda", precision=precision)), needs="GPU",
+            is_variant=precision == "32-true" or len(job.scenarios) == 1,
+        )
+        for name, job in (
+            ("rollouts, tiny, A", Job("rollouts", scenarios=("A",))),
+            ("rollouts, tiny, 16 scenarios", Job("rollouts", scenarios=("A", "B") * 8)),
+            ("pre-training update, tiny, 16 scenarios", Job("pretrain", scenarios=("A", "B") * 8)),
+            ("CAT-K update, tiny, 16 scenarios", Job("catk", scenarios=("A", "B") * 8)),
+            ("fine-tuning update, tiny, 4 × 8", Job("finetune", data="synthetic", model="tiny")),
+        )
+        for precision in ("32-true", "bf16-mixed")
+    ),
 )
 # fmt: on
 
@@ -398,7 +416,8 @@ def describe_versions(options: Options, revision: str) -> str:
 
 def describe_size(options: Options) -> str:
     rollouts = f"{options.num_rollouts} rollouts (of the public code {options.public_rollouts} are timed)"
-    return f"{options.repeats} repetitions, {rollouts}, {'the whole demo' if options.full_demo else 'demo --quick'}"
+    dry_run = "dry run, whose numbers of the GPU are the CPU's, " if options.dry_run else ""
+    return f"{dry_run}{options.repeats} repetitions, {rollouts}, {'the whole demo' if options.full_demo else 'demo --quick'}"
 
 
 def lines_of(measurement: Measurement, samples: Samples) -> str:
@@ -452,7 +471,7 @@ def main(options: Options) -> None:
     table = [f"# Speed, {date.today()}\n\n{setup}\n\n{NOTES}\n{HEADER}"]
     print(table[0], flush=True)
     for measurement in MEASUREMENTS:
-        if measurement.row in rows:
+        if measurement.row in rows and not (options.dry_run and measurement.is_variant):
             missing = measurement.missing(options)
             empty = f"| {measurement.name} | {missing} | | | | | |"
             table.append(empty if missing else lines_of(measurement, results.of(measurement, options)))

@@ -49,6 +49,12 @@ class Job:
     top_k: int | None = 48
     """None = all tokens."""
     device: str = "cpu"
+    precision: str = "32-true"
+    """As in `DeviceConfig`; "bf16-mixed" computes under autocast what it holds safe."""
+    batch_size: int = 4
+    """Scenarios of a fine-tuning update."""
+    model: str = "demo"
+    """That a fine-tuning update starts from: "demo", or "tiny"."""
     shared: str = ""
     """Folder of the official material; of `prepare_evaluated`: the folder with its records."""
     checkout: str = ""
@@ -131,7 +137,14 @@ def start(job: Job) -> Repeat:
 
     keep_freed_memory()  # as the command line does
     torch.set_num_threads(1)
-    repeat = MEASURED[job.task](job)
+    work = MEASURED[job.task](job)
+
+    def repeat() -> Numbers | None:
+        # an update of fine-tuning has an autocast of its own inside
+        is_coarse = job.precision == "bf16-mixed" and job.task != "finetune"
+        with torch.autocast(job.device, torch.bfloat16, enabled=is_coarse):
+            return work()
+
     repeat()
     return repeat
 
@@ -162,7 +175,7 @@ def tiny(job: Job) -> Any:
 
 
 def finetune(job: Job) -> Repeat:
-    """An update of the demo's sizes by the paper's objective: simulate, reward, score, step."""
+    """An update of a few scenarios and 8 rollouts by the paper's objective: simulate, reward, score, step."""
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.recipes.smart import smart_demo_rlftsim
     from rlftsim.scenario.dataset import ScenarioDataset
@@ -175,8 +188,10 @@ def finetune(job: Job) -> Repeat:
     # the recipe's own objective is not that of all versions
     objective = {"credit": "rollout", "imitation_weight": 0.0, "kl": replace(config.kl, target=0.05)}
     known = {name: value for name, value in objective.items() if hasattr(config, name)}
-    config = replace(config, device=DeviceConfig(job.device, threads=1), **known)
-    policy = SmartPolicy.from_pretrained(Path(job.inputs) / "base" / "model")
+    device = DeviceConfig(job.device, threads=1, precision=job.precision)
+    config = replace(config, batch_size=job.batch_size, device=device, **known)
+    folder = Path(job.inputs) / ("tiny" if job.model == "tiny" else "base/model")
+    policy = SmartPolicy.from_pretrained(folder)
     dataset = ScenarioDataset(pack_path() if job.data == "synthetic" else Path(job.inputs) / "real", "training")
     fabric = start_fabric(config.device)
     scenarios = [dataset[i] for i in range(config.batch_size)]

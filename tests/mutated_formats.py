@@ -21,6 +21,7 @@ import made_up
 import rlftsim as rs
 import scenes
 import tiny
+from alpasim_files import write_alpasim
 from av2_files import write_av2
 from gpudrive_files import write_file
 from rlftsim.cli.main import main, parse
@@ -645,6 +646,12 @@ FORMATS: Mapping[str, Format] = {
         make_catk,
         import_catk("weights.safetensors"),
         ("policies.smart.catk_checkpoint",),
+    ),
+    "AlpaSim's CAT-K": Format(
+        {"catk_v120/config.yaml": "text", "catk_v120/latest.ckpt": "checkpoint", "tokens/*.pkl": "text"},
+        write_alpasim,
+        lambda folder: run("model", "import", folder / "catk_v120", "--from", "alpasim", "--out", folder / "model"),
+        ("policies.smart.alpasim_checkpoint",),
     ),
     "run": Format(
         {"run/config.json": "json", "run/metrics.jsonl": "jsonl", "run/trackers.json": "json"},

@@ -16,6 +16,7 @@ from run_pages import ROOT, blocks_of
 import rlftsim as rs
 import scenes
 import third_party
+from alpasim_files import write_alpasim
 from av2_files import write_av2
 from gpudrive_files import write_file
 from made_up import CPU, TINY
@@ -104,6 +105,7 @@ def write_things(folder: Path) -> None:
     (folder / "rollouts").mkdir()
     write_rollouts(folder / "rollouts", collate([scenario]), rollouts)
     write_pickles(folder, policy, folder / "rollouts" / "v1.npz")
+    write_alpasim(folder / "trafficsim-models")
 
 
 def write_template(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""The speed table prints what it measures, and says what it cannot."""
+"""The speed table prints what it measures, says what it cannot, and tries the rows of a GPU on the CPU."""
 
 import subprocess
 import sys
@@ -24,3 +24,18 @@ def test_the_speed_table_has_a_line_for_each_row_and_continues_where_it_was_stop
     assert torch.cuda.is_available() or "| rollouts, tiny, A | no GPU |" in first
     assert rows[0] in again  # to the last digit: kept, not measured again
     assert rows[0] in (tmp_path / "table.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.official
+def test_a_dry_run_does_every_work_of_the_gpu_in_half_precision_on_the_cpu(shared, tmp_path):
+    words = ["--shared", shared, "--rows", "gpu", "--repeats", "1", "--dry-run"]
+    command = [str(word) for word in (sys.executable, BENCHMARK, tmp_path, *words)]
+
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    rows = [line for line in printed.splitlines() if "wall s on the GPU" in line]
+    assert [line.split(",")[0] for line in rows] == [
+        "| metric", "| rollouts", "| pre-training update", "| CAT-K update", "| fine-tuning update",
+    ]  # fmt: skip
+    assert all("bf16-mixed" in line for line in rows[1:])

@@ -26,6 +26,7 @@ import small_things
 MAX_NOT_RUN = 0.1
 TAKEN_FOR_GRANTED = {
     "README.md": ("womd",),
+    "alpasim.md": ("DATA", "trafficsim-models"),
     "catk.md": (
         "DATA", "epoch_031.ckpt", "agent_vocab.npz", "map_tokens.npz", "agent_vocab_555_s2.pkl", "map_traj_token5.pkl",
     ),

@@ -56,6 +56,15 @@ def test_episodes_that_do_not_count_change_nothing():
     assert measure(simulated, mask=mask)["planner_error"][1] == 0
 
 
+def test_a_planner_that_always_fails_leaves_the_statistics_of_the_others():
+    simulated, mask = np.array(TRUTH) + 0.1, ALL.copy()
+    simulated[2], mask[2] = np.nan, False
+    without = measure_agreement(np.array([TRUTH, simulated])[:, :2], ALL[:2], EQUAL)
+    for name, statistic in measure(simulated, mask=mask).items():
+        np.testing.assert_array_equal(statistic, without[name][0])
+        assert np.isfinite(statistic).all()
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_rank_correlation_and_r_squared_are_those_of_scipy_with_ties_too(seed):
     x, y = np.random.default_rng(seed).integers(0, 4, (2, 9)).astype(float)

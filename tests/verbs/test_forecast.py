@@ -1,6 +1,7 @@
 """`rlftsim doctor --plan finetune|pretrain`: what a training takes, from its own first updates."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -49,6 +50,16 @@ def measured(monkeypatch):
 
     monkeypatch.setattr(forecast, "measure_run", measure_run)
     return words_of_runs
+
+
+def test_a_run_of_one_update_says_that_its_time_is_not_measured(monkeypatch, capsys):
+    settings = {"batch_size": 160, "micro_batch_size": 8, "device.processes": 2, "epochs": 1.0, "seed": 0}
+    monkeypatch.setattr(forecast, "measure_run", lambda *_: MeasuredRun(math.nan, GB, settings))
+    words = ["doctor", "--plan", "finetune", "--recipe", "smart-demo", "--data", "synthetic", "--method", "rlft"]
+    assert main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "not measured: it takes 2 updates, this run has 1" in text
+    assert "nan" not in text
 
 
 def test_updates_time_and_memory_are_those_of_the_command_itself(measured, monkeypatch, capsys, tmp_path):

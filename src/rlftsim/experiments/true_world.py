@@ -160,12 +160,14 @@ def measure_agreement(
 
     planner_error: mean over planners of the error of a planner's mean; bias: the same with signs; episode_error: mean
     error of an episode; changed: fraction of episodes off by more than 0.05; tau_b and r_squared of planners' means.
+    Planners without an episode that counts are left out.
 
     Args:
         values: Score of each episode.
         mask: True = the episode counts.
         weights: Weights of the windows.
     """
+    values, mask = values[:, mask.any(1)], mask[mask.any(1)]
     means = average(values, mask, weights)
     difference, error = means - means[:, :1], np.abs(values - values[:1])
     truth = np.broadcast_to(means[:, :1], means.shape)

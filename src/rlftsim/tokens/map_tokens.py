@@ -1,6 +1,7 @@
 """Tokenization of maps: pieces of polylines of up to 5 m, each with a position, a heading and a type.
 
-M map tokens. The rules (polylines, types, 5 m windows) are those of the public SMART code, in array form.
+M map tokens. The rules (polylines, types, 5 m windows) are those of the public SMART code, in array form. Prototypes of
+three points are AlpaSim's, whose maps are cut by its rules (`catk/map_adapter.py` there): pieces of 8 m.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +19,10 @@ from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatureType, Sce
 SPACING_M = 0.5
 WINDOW = 11
 """Points of a window: 5 m."""
+TRIPLE = 3
+"""Points of a piece in AlpaSim."""
+TRIPLE_SPACING_M = 4.0
+"""Distance of these points."""
 MAX_GAP_M = 3.0
 """Polylines are cut where consecutive points are farther apart."""
 NO_MAP_POSITION_M = 60_000.0
@@ -77,14 +82,16 @@ class MapTokens:
     token_mask: Bool[Tensor, "B M"]
 
 
-def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> MapTokens:
-    """Map tokens of a batch: for each piece the nearest prototype (sum of squared distances at points 0, 5, 10).
+def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V n 2"]) -> MapTokens:
+    """Map tokens of a batch: for each piece the nearest prototype (sum of squared distances at three points).
 
     Args:
         batch: Batch of which only the scenarios and the frame are read.
-        prototypes: Map prototypes of the vocabulary, each in the frame of the first point.
+        prototypes: Map prototypes of the vocabulary, each in the frame of the first point. Three points are compared:
+            the first, the middle and the last.
     """
-    maps = [split_map(scenario) for scenario in batch.scenarios]
+    num_points = prototypes.shape[1]
+    maps = [split_map(scenario, num_points) for scenario in batch.scenarios]
     if batch.light_step != CURRENT_STEP:
         maps = [_relight(pieces, scenario, batch.light_step) for pieces, scenario in zip(maps, batch.scenarios)]
 
@@ -98,7 +105,7 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> M
     heading = pad([segments.heading for segments in maps], torch.float32)
     # Each piece in its own frame, flattened, against the prototypes; `argmin` takes the lowest index on ties.
     local = rotate(points - points[:, :, :1], -heading[..., None]).flatten(2)  # [B, M, 6]
-    table = prototypes.to(batch.device)[:, [0, 5, 10]].flatten(1)  # [V, 6]
+    table = prototypes.to(batch.device)[:, [0, num_points // 2, -1]].flatten(1)  # [V, 6]
     nearest = [torch.cdist(rows, table, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1) for rows in local]
     return MapTokens(
         position=points[:, :, 0],
@@ -110,14 +117,19 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> M
 
 
 @cached_on_scenario
-def split_map(scenario: Scenario) -> MapSegments:
+def split_map(scenario: Scenario, num_points: int = WINDOW) -> MapSegments:
     """A scenario's map in pieces of up to 5 m; cached with the scenario.
 
     A scenario without any usable polyline gets a single dummy piece out of reach of all agents.
+
+    Args:
+        scenario: Scenario whose map and current lights are read.
+        num_points: `WINDOW`, or `TRIPLE` for the pieces of AlpaSim, which has no speed bumps and no driveways.
     """
     features = scenario.map_features
     # 1. Polylines by family (lanes, road edges, road lines, polygons), each family in file order.
-    families = ((0, 1, 2, 3), (14, 15, 16), tuple(range(5, 14)), (18, 19, 20))
+    polygons = (18, 19, 20) if num_points == WINDOW else (18,)
+    families = ((0, 1, 2, 3), (14, 15, 16), tuple(range(5, 14)), polygons)
     order = [(int(i), family) for family, types in enumerate(families) for i in features.find_indices(types)]
     stop_lanes = set(features.topology.stop_sign_lanes[:, 1].tolist())
     # 2. Light of each lane at the current step; of a lane that is listed twice, the last one.
@@ -132,12 +144,12 @@ def split_map(scenario: Scenario) -> MapSegments:
             continue
         feature_type = int(features.feature_type[index])
         lane_id = int(features.feature_id[index])
-        if family == 3:
+        if family == 3 and num_points == WINDOW:
             polyline = _polygon_sides(features.polygon(index))
         type_ = _FEATURE_TO_TYPE[feature_type]
         if family == 0 and lane_id in stop_lanes and feature_type != MapFeatureType.LANE_BIKE:
             type_ = STOP_SIGN_LANE_TYPE
-        groups.append(_cut(polyline[:, :2]))
+        groups.append((_cut if num_points == WINDOW else _cut_triples)(polyline[:, :2]))
         label = [type_, family, lights.get(lane_id, 0) if family == 0 else 0]
         labels.append(np.tile(np.array(label, np.int8), (len(groups[-1][1]), 1)))
         lanes.append(np.full(len(groups[-1][1]), lane_id if family == 0 else -1))
@@ -218,12 +230,23 @@ def _cut(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return all_points, all_headings, all_windows
 
 
-def _resample_line(run: np.ndarray) -> np.ndarray:
-    """A point every 0.5 m along a polyline, and the end point."""
+def _cut_triples(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `_cut`, by AlpaSim's rules: pieces of two chords of 4 m, the last of which end where the polyline ends."""
+    resampled = _resample_line(polyline.astype(np.float64), TRIPLE_SPACING_M)
+    starts = np.arange(0, len(resampled) - 2, 2)
+    starts = np.union1d(starts, len(resampled) - TRIPLE) if len(starts) else starts
+    points = resampled[starts[:, None] + np.arange(TRIPLE)]
+    direction = points[:, 1] - points[:, 0]
+    heading = np.arctan2(direction[:, 1], direction[:, 0])
+    return points.astype(np.float32), heading.astype(np.float32), np.zeros((0, WINDOW, 2), np.float32)
+
+
+def _resample_line(run: np.ndarray, spacing_m: float = SPACING_M) -> np.ndarray:
+    """A point every half meter, or in another distance, along a polyline, and the end point."""
     # Lengths of segments are rounded to float32 and summed in float64, as in the public code.
     lengths = np.linalg.norm(np.diff(run, axis=0).astype(np.float32), axis=-1)
     distance = np.concatenate([[0.0], np.cumsum(lengths, dtype=np.float64)])
     if len(run) < 2 or distance[-1] == 0.0:
         return run[:1]
-    grid = np.append(np.arange(0.0, distance[-1], SPACING_M), distance[-1])
+    grid = np.append(np.arange(0.0, distance[-1], spacing_m), distance[-1])
     return np.stack([np.interp(grid, distance, run[:, c]) for c in (0, 1)], axis=-1)

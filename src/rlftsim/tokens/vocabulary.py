@@ -70,8 +70,9 @@ class Vocabulary:
     """Boxes at steps 0..5 in the frame of the start pose; rows past a class's own number of tokens are zero."""
     token_mask: Bool[Tensor, "C V"]
     """True = the token exists. `STILL_TOKEN` does in every class."""
-    map_prototypes: Float[Tensor, "P 11 2"]
-    """Pieces of 5 m, a point every 0.5 m, start at the origin with heading 0."""
+    map_prototypes: Float[Tensor, "P n 2"]
+    """Pieces of 5 m, a point every 0.5 m, start at the origin with heading 0. Three points make pieces of 8 m, see
+    `map_tokens`."""
     origin: str = ""
     """Command, data and seed of the vocabulary."""
 
@@ -152,7 +153,7 @@ def check_tables(tables: Mapping[str, Tensor]) -> None:
     shapes = {
         "corners": (len(CLASS_NAMES), num_tokens, STEPS_PER_TOKEN + 1, 4, 2),
         "token_mask": (len(CLASS_NAMES), num_tokens),
-        "map_prototypes": (num_pieces, 11, 2),
+        "map_prototypes": (num_pieces, 3 if tables["map_prototypes"].shape[1:2] == (3,) else 11, 2),
     }
     for name, dtype in _DTYPES.items():
         if tables[name].dtype != dtype or tables[name].shape != shapes[name]:

@@ -259,8 +259,11 @@ def training_table(command: TrainingCommand, forecast: TrainingForecast) -> Tabl
     fits = "" if needed <= available else ", which does not fit"
     total = forecast.num_updates * forecast.seconds
     table.add_row("updates", str(forecast.num_updates))
-    table.add_row("an update", f"{forecast.seconds:.3g} s (mean of {forecast.num_measured})")
-    table.add_row("in all", f"{total:.0f} s" if total < 120 else f"{total / 60:.0f} min")
+    if math.isnan(total):
+        table.add_row("time", f"not measured: it takes {WARM_UP + 1} updates, this run has {forecast.num_updates}")
+    else:
+        table.add_row("an update", f"{forecast.seconds:.3g} s (mean of {forecast.num_measured})")
+        table.add_row("in all", f"{total:.0f} s" if total < 120 else f"{total / 60:.0f} min")
     table.add_row("peak memory", f"{needed:.1f} GB of {available:.1f} GB, with the largest batch{fits}")
     table.add_row("micro batch", f"{forecast.micro_batch} now, up to {forecast.fitting_micro_batch} fit")
     return table

@@ -1,6 +1,7 @@
-"""`rlftsim model`: show, average and upload models, import and export checkpoints of the public CAT-K code."""
+"""`rlftsim model`: show, average and upload models, import and export checkpoints of CAT-K."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,30 +16,40 @@ from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.checkpoint import CARD, find_model, read_card
 from rlftsim.policies.hub import FILES, push_files
 from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
+from rlftsim.policies.smart.alpasim_checkpoint import import_alpasim
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import append_cards
 from rlftsim.recipes.docstrings import summarize_docstring
 
 Format = Literal["catk"]
+Source = Literal["catk", "alpasim"]
 
 
-def import_model(checkpoint: Path, vocabulary: list[Path], out: Path, *, format: Format = "catk") -> None:
-    """Convert a checkpoint of the public CAT-K code to a model folder.
+def import_model(checkpoint: Path, out: Path, *, vocabulary: Sequence[Path] = (), format: Source = "catk") -> None:
+    """Convert a checkpoint of the public CAT-K code, or of AlpaSim's, to a model folder.
 
     No code in the checkpoint is executed. It must have exactly the expected weights with the right shapes;
     otherwise all differences are listed and nothing is written.
 
     Args:
-        checkpoint: File: Lightning .ckpt, or .safetensors with the keys of its state dict.
-        vocabulary: Token tables of its training: npz with veh, ped, cyc and traj_src (may be two files), or a
-            vocabulary file.
+        checkpoint: File: Lightning .ckpt, or .safetensors with the keys of its state dict. Of AlpaSim the folder
+            catk_v120, with the folder tokens beside it.
         out: Folder for the model.
+        vocabulary: Token tables of its training: npz with veh, ped, cyc and traj_src (may be two files), or a
+            vocabulary file. AlpaSim's are found by its settings.
         format: Code that the checkpoint comes from.
+
+    Raises:
+        ConfigError: Token tables are missing, or named for AlpaSim; or the folder holds files.
     """
     _check_empty(out)
-    imported = import_catk(checkpoint, vocabulary)
-    imported.policy.save_pretrained(out, card=_card(checkpoint, imported))
+    if format == "catk" and not vocabulary:
+        raise ConfigError(f"{checkpoint}: comes without its token tables: hand them over, --vocabulary.")
+    if format == "alpasim" and vocabulary:
+        raise ConfigError("--vocabulary has no effect with --from alpasim: its tables are in the folder tokens.")
+    imported = import_catk(checkpoint, vocabulary) if format == "catk" else import_alpasim(checkpoint)
+    imported.policy.save_pretrained(out, card=_card(checkpoint, imported, format))
     weights = sum(p.numel() for p in imported.policy.parameters())
     print_line(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
     for note in imported.notes:
@@ -157,15 +168,22 @@ def _check_empty(folder: Path) -> None:
         raise ConfigError(f"{folder} is not empty: name another folder for the model.")
 
 
-def _card(checkpoint: Path, imported: CatkImport) -> str:
+_ORIGIN = {
+    "catk": """a checkpoint of the public CAT-K code
+* computes what the public code computes (`catk_compat`)
+* terms: those of the checkpoint, of its token tables (CAT-K's own: NVIDIA, non-commercial research) and of the data
+  that it was trained on (Waymo Open Motion Dataset: non-commercial)""",
+    "alpasim": """a CAT-K model in AlpaSim's layout
+* terms: those of the files (NVlabs/alpasim: Apache-2.0) and of the data that it was trained on""",
+}
+
+
+def _card(checkpoint: Path, imported: CatkImport, source: Source) -> str:
     notes = "\n".join(f"* {note}" for note in imported.notes)
     return f"""# SMART traffic model ({imported.size}), imported
 
-* from {checkpoint.name}, a checkpoint of the public CAT-K code
+* from {checkpoint.name}, {_ORIGIN[source]}
 {notes}
-* computes what the public code computes (`catk_compat`)
-* terms: those of the checkpoint, of its token tables (CAT-K's own: NVIDIA, non-commercial research) and of the data
-  that it was trained on (Waymo Open Motion Dataset: non-commercial)
 * command: rlftsim {" ".join(sys.argv[1:])}
 * rlftsim {__version__}
 """

@@ -173,6 +173,16 @@ def test_averages_are_of_policies_with_the_same_features(base):
         average_policies([CalibratedPolicy(base, NAMES[:2]), CalibratedPolicy(base, NAMES[1:3])])
 
 
+def test_half_precision_coarsens_the_base_and_not_the_tilt(calibrated):
+    with torch.autocast("cpu", torch.bfloat16):
+        tilted = distribution_of(calibrated, SCENES[1])
+        logits, base_logits = tilted.logits, tilted.base.logits
+    row, token, _ = tilted._pairs
+    tilt = (logits - base_logits)[row, token]
+    torch.testing.assert_close(tilt, tilted.values @ tilted.eta, rtol=0, atol=1e-5)
+    assert tilt.abs().max() > 0.1
+
+
 def test_further_training_moves_the_base_below_a_fixed_eta(calibrated):
     learner = copy.deepcopy(calibrated).requires_grad_(True)
     batch = collate([SCENES[0]])

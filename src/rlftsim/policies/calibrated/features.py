@@ -193,7 +193,8 @@ class TiltedDistribution(CategoricalDistribution):
         logits = self.base.logits
         if not self.eta.any():
             return logits
-        return logits.flatten().index_add(0, self._pairs[2], self.values @ self.eta).view_as(logits)
+        with torch.autocast(logits.device.type, enabled=False):  # tilts of hundredths count
+            return logits.flatten().index_add(0, self._pairs[2], self.values @ self.eta).view_as(logits)
 
     @cached_property
     def values(self) -> Float[Tensor, "P K"]:

@@ -11,7 +11,7 @@ refused.
 import collections
 import hashlib
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, s
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.policy import Sampling
+from rlftsim.tokens.map_tokens import WINDOW
 from rlftsim.tokens.vocabulary import MAX_COORDINATE_M, MAX_TOKENS, STEPS_PER_TOKEN, Vocabulary
 
 CATK_SAMPLING = Sampling(top_k=48)
@@ -36,7 +37,6 @@ CATK_SAMPLING = Sampling(top_k=48)
 MOTION_TABLES = ("veh", "ped", "cyc")
 MAP_TABLE = "traj_src"
 _AGENT_SHAPE = (STEPS_PER_TOKEN + 1, 4, 2)
-_MAP_SHAPE = (11, 2)
 
 PUBLISHED_AGENT_FILE = "agent_vocab_555_s2.pkl"
 PUBLISHED_NUM_TOKENS = 2048
@@ -117,10 +117,24 @@ def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
         except FileNotFoundError:
             raise CheckpointError(f"{path}: no such vocabulary.") from None
     source = ", ".join(str(p) for p in paths)
-    missing = [name for name in names if name not in tables]
+    return build_catk_vocabulary(tables, source)
+
+
+def build_catk_vocabulary(tables: dict[str, np.ndarray], source: str, *, num_map_points: int = WINDOW) -> Vocabulary:
+    """Vocabulary of the public code's token tables.
+
+    Args:
+        tables: `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, n, 2], meters.
+        source: Files of the tables, which begin every message.
+        num_map_points: Points n of a map piece.
+
+    Raises:
+        CheckpointError: A table is missing, has the wrong shape, or values that are no coordinates.
+    """
+    missing = [name for name in (*MOTION_TABLES, MAP_TABLE) if name not in tables]
     if missing:
         raise CheckpointError(f"{source}: no table {', '.join(missing)}: hand over veh, ped, cyc and traj_src.")
-    _check_tables(tables, source)
+    _check_tables(tables, source, num_map_points)
     # classes in this package's order: vehicles, pedestrians, cyclists [3, V, 6, 4, 2]
     corners = torch.from_numpy(np.stack([tables[name] for name in MOTION_TABLES]).astype(np.float32))
     prototypes = torch.from_numpy(tables[MAP_TABLE].astype(np.float32))
@@ -157,13 +171,13 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     write_atomically(path, write)
 
 
-def _check_tables(tables: dict[str, np.ndarray], source: str) -> None:
+def _check_tables(tables: dict[str, np.ndarray], source: str, num_map_points: int) -> None:
     """Check shapes, types, numbers of tokens and coordinates of the tables.
 
     Raises:
         CheckpointError: A table differs from the form of the public code; the message names the first kind of mistake.
     """
-    shapes = {name: ("V", *_AGENT_SHAPE) for name in MOTION_TABLES} | {MAP_TABLE: ("P", *_MAP_SHAPE)}
+    shapes = {name: ("V", *_AGENT_SHAPE) for name in MOTION_TABLES} | {MAP_TABLE: ("P", num_map_points, 2)}
     problems = [
         f"{name} has shape {tables[name].shape} instead of ({', '.join(map(str, shape))})"
         for name, shape in shapes.items()
@@ -319,24 +333,50 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
             or unequal where they must be equal (the first are named); the vocabulary does not belong to the weights.
     """
     weights, settings = _read(checkpoint)
+    imported = build_catk_policy(weights, settings, checkpoint, lambda: read_catk_vocabulary(vocabulary))
+    note = _vocabulary_note(settings, has_published_tokens(imported.policy.vocabulary), checkpoint)
+    source, draws = imported.notes
+    return replace(imported, notes=(source, note, draws))
+
+
+def build_catk_policy(
+    weights: dict[str, Tensor],
+    settings: dict[str, Any],
+    checkpoint: Path,
+    read_vocabulary: Callable[[], Vocabulary],
+    *,
+    num_map_points: int = WINDOW,
+) -> CatkImport:
+    """Model of the public code's weights; notes on sizes and sampling.
+
+    Args:
+        weights: All weights by the public code's names.
+        settings: Groups `decoder` and `validation_rollout_sampling` of the public code; may be empty.
+        checkpoint: File that begins every message.
+        read_vocabulary: Reader of the token tables, called once the weights fit.
+        num_map_points: Points of a map prototype.
+
+    Raises:
+        CheckpointError: Weights that do not fit, all of which are named, or a vocabulary of another size.
+    """
     config, source = _find_config(weights, settings, checkpoint)
     head = weights.get(_HEAD_BIAS, torch.zeros(PUBLISHED_NUM_TOKENS))
     if head.dim() != 1 or not 1 <= len(head) <= MAX_TOKENS:
         raise CheckpointError(f"{checkpoint}: {_HEAD_BIAS} has shape {tuple(head.shape)}, not one number a token.")
-    weights = _translate(weights, outline(lambda: SmartNetwork(config, len(head))), str(checkpoint))
-    tables = read_catk_vocabulary(vocabulary)
+    expected = outline(lambda: SmartNetwork(config, len(head), num_map_points=num_map_points))
+    weights = _translate(weights, expected, str(checkpoint))
+    tables = read_vocabulary()
     if tables.num_tokens != len(head) or not tables.token_mask.all():
         raise CheckpointError(
             f"{checkpoint}: predicts {len(head)} tokens a class, the vocabulary holds "
             f"{', '.join(str(int(n)) for n in tables.token_mask.sum(1))}: hand over the one it was trained with."
         )
-    note = _vocabulary_note(settings, has_published_tokens(tables), checkpoint)
     sampling = _find_sampling(settings)
     policy = SmartPolicy(config, tables, sampling)
     policy.network.load_state_dict(weights)
     sizes = (name for name, preset in PRESETS.items() if replace(preset(), catk_compat=True) == config)
     draws = f"samples among the {sampling.top_k} most likely tokens, temperature {sampling.temperature:g} (config.json)"
-    return CatkImport(policy.eval(), next(sizes, "custom"), (source, note, draws))
+    return CatkImport(policy.eval(), next(sizes, "custom"), (source, draws))
 
 
 def _find_sampling(settings: dict[str, Any]) -> Sampling:
@@ -354,9 +394,11 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
     """Copies of a model's weights under the public code's names, on the CPU; a second import gives the same bits.
 
     Raises:
-        CheckpointError: The model is goal-conditioned, or has a head that the public code lacks.
+        CheckpointError: The model is goal-conditioned, comes from AlpaSim, or has a head that the public code lacks.
     """
     lacking = "has no form in the public CAT-K code"
+    if policy.vocabulary.map_prototypes.shape[1] != WINDOW:
+        raise CheckpointError(f"a model of AlpaSim, whose map pieces have other points, {lacking}.")
     if policy.is_goal_conditioned:
         raise CheckpointError(f"a goal-conditioned model {lacking}: export the one it came from.")
     for setting, reason in (("head_per_class", ", which has one head for all classes"), ("continuation_scores", "")):

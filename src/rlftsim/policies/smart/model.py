@@ -22,6 +22,7 @@ from rlftsim.policies.distributions import (
     LazyTokenDistribution,
     TokenDistribution,
     TokenRows,
+    at_least_float32,
 )
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import ClassHeads
@@ -61,7 +62,8 @@ class SmartModel(nn.Module):
         self.vocabulary = vocabulary
         # numbers of tokens that exist, by class
         class_sizes = tuple(vocabulary.token_mask.sum(1).tolist()) if config.head_per_class else ()
-        self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes)
+        num_map_points = vocabulary.map_prototypes.shape[1]
+        self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes, num_map_points)
 
     def _apply(self, fn, recurse: bool = True):
         """Moves to a device take the vocabulary along."""
@@ -228,4 +230,5 @@ class SmartModel(nn.Module):
             last_phase = x[:, self.config.dim :]
             hidden = torch.cat([hidden, scores.queries(hidden, last_phase, class_id)], -1)
             weight = torch.cat([weight, scene.token_keys.keys], -1)
+        hidden = at_least_float32(hidden)  # logits may be computed after autocast has ended
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask, self.sampling)

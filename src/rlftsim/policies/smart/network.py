@@ -52,7 +52,7 @@ from rlftsim.policies.smart.neighbors import Poses, bound_neighbors, find_neighb
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import find_rows, place_rows
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens, tokenize_map
+from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, WINDOW, MapTokens, tokenize_map
 from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary, class_of_type
 
 MAX_LOOK_BACK_M = 160.0
@@ -152,11 +152,11 @@ class View:
 class MapEncoder(nn.Module):
     """Attention among the map tokens of a scenario."""
 
-    def __init__(self, config: SmartConfig):
+    def __init__(self, config: SmartConfig, num_map_points: int):
         super().__init__()
         self.config = config
         dim = config.dim
-        self.token = MlpEmbedding(22, dim)
+        self.token = MlpEmbedding(2 * num_map_points, dim)
         self.feature_type = nn.Embedding(NUM_TYPES, dim)
         self.kind = nn.Embedding(NUM_FAMILIES, dim)
         self.light = nn.Embedding(NUM_LIGHTS, dim)
@@ -164,7 +164,7 @@ class MapEncoder(nn.Module):
         sizes = (dim, config.num_heads, config.head_dim, config.dropout)
         self.layers = nn.ModuleList(RelationAttention(*sizes) for _ in range(config.num_map_layers))
 
-    def forward(self, tokens: MapTokens, prototypes: Float[Tensor, "P 11 2"]) -> Float[Tensor, "BM D"]:
+    def forward(self, tokens: MapTokens, prototypes: Float[Tensor, "P n 2"]) -> Float[Tensor, "BM D"]:
         """Features of all map tokens, scenario after scenario. Padding has arbitrary finite features.
 
         Args:
@@ -424,11 +424,14 @@ class SmartNetwork(nn.Module):
         config: Sizes, radii and options of the architecture.
         num_tokens: Largest number of tokens V of a class, the width of the logits.
         class_sizes: Number of tokens of each class, each with a head; empty = all classes share a single head.
+        num_map_points: Points n of a map prototype.
     """
 
-    def __init__(self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = ()):
+    def __init__(
+        self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = (), num_map_points: int = WINDOW
+    ):
         super().__init__()
-        self.map_encoder = MapEncoder(config)
+        self.map_encoder = MapEncoder(config, num_map_points)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self, config.frequency_init)
         if self.decoder.goal is not None:
