@@ -43,6 +43,8 @@ from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk, writ
 from rlftsim.policies.smart.config import smart_nano
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.recipes.settings import recipe_as_json
+from rlftsim.rollout.entries import Entrants, FittedEntries, load_entries, write_entries
+from rlftsim.rollout.gates import GateFinder
 from rlftsim.scenario.synthetic import generate, worlds
 from rlftsim.scenario.tfrecord import write_records
 from rlftsim.scenario.transfer import pull_dataset
@@ -278,6 +280,18 @@ def make_catk(folder: Path) -> None:
     torch.save(content, folder / "epoch.ckpt")
     write_catk(policy, folder / "weights.safetensors")
     write_catk_vocabulary(policy.vocabulary, folder / "tables.npz")
+
+
+def make_entries(folder: Path) -> None:
+    entrants = Entrants(np.array([1, 2]), np.array([0.0, 2.0]), np.array([0.0, 3.0]), np.array([9.0, 1.0]))
+    write_entries(folder / "entries.npz", FittedEntries((-4.0, 0.3, 0.5), entrants))
+
+
+def read_entries(folder: Path) -> None:
+    model = load_entries(str(folder / "entries.npz"))
+    gates = GateFinder(scenes.straight_road()).find(np.zeros(2), np.ones(2), 50.0)
+    assert np.isfinite(model.expect(gates)).all()
+    model.draw(gates, np.random.default_rng(0))
 
 
 def make_learned_planner(folder: Path) -> None:
@@ -687,6 +701,7 @@ FORMATS: Mapping[str, Format] = {
         ("envs.failure_run",),
     ),
     "measurements": Format({"*/s?.json": "json"}, make_measured, measure, ("evaluation.resumable",)),
+    "entries": Format({"entries.npz": "npz"}, make_entries, read_entries, ("rollout.entries",)),
     "rollouts": Format({"rollouts/*": "npz"}, make_rollouts, score("rollouts"), ("evaluation.rollout_files",)),
     "messages of rollouts": Format(
         {"all.binproto": "submission"}, make_messages, score("all.binproto"), ("evaluation.rollout_files",)

@@ -225,6 +225,7 @@ def test_what_its_users_refuse_is_listed_as_failing(tmp_path, capsys):
             r"experiment 'bad' is of type int: make it a rlftsim.experiments.results.Experiment",
         ),
         "rlftsim.trackers": ("five", r"tracker 'bad' has no start, log, artifact, finish: see docs/trackers.md"),
+        "rlftsim.entries": ("five", r"entry model 'bad' is of type int: give it expect and draw"),
         "rlftsim.exporters": (
             "five",
             r"exporter 'bad' cannot be called \(.*\): make it a function of scenario, rollouts and folder",

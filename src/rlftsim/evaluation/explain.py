@@ -179,5 +179,5 @@ def to_scene_motion(scenario: Scenario, states: SimulatedStates) -> SceneMotion:
     return SceneMotion(
         position=after_history(log.position, future),
         heading=after_history(log.heading, states.heading[:, order]),
-        valid=np.concatenate([valid, np.ones(future.shape[:3], bool)], axis=2),
+        valid=np.concatenate([valid, states.presence[:, order].cpu().numpy()], axis=2),
     )

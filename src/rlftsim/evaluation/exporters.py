@@ -21,6 +21,7 @@ from rlftsim.goals.goals_file import GoalEntry, GoalsFile
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.realism import SimulatedStates
+from rlftsim.rollout.open_world import add_visitors
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.film import to_film
@@ -157,7 +158,7 @@ def report_rollouts(
     for scenario in map(dataset.by_id, scenario_ids if exporters else ()):
         states = read_rollouts(_entry(folder, scenario.scenario_id), scenario)
         for write in exporters:
-            print_line(write(scenario, states, folder))
+            print_line(write(with_entrants(scenario, states), states, folder))
 
 
 def _entry(folder: Path, scenario_id: str) -> RolloutEntry:
@@ -178,12 +179,17 @@ def read_rollouts(entry: RolloutEntry, scenario: Scenario) -> SimulatedStates:
     # Files of an earlier call may be damaged or of an older data set.
     way_out = "remove it, then run the same command again."
     try:
-        states = read_states(entry)
+        states = read_states(entry, None)
     except DataError as error:
         raise DataError(f"{str(error).rstrip('.')}: {way_out}") from None
     if not np.isin(scenario.tracks.object_id[scenario.simulated_indices], states.object_id).all():
         raise DataError(f"{entry}: lacks agents of the scenario: {way_out}")
     return states
+
+
+def with_entrants(scenario: Scenario, states: SimulatedStates) -> Scenario:
+    """The scenario with the agents that may have entered, if there are such agents among the rollouts'."""
+    return add_visitors(scenario) if states.valid is not None else scenario
 
 
 def _outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:

@@ -33,7 +33,7 @@ def write_gpudrive(scenario: Scenario, states: SimulatedStates, folder: Path) ->
     tracks = scenario.tracks.select(simulated)
     order = states.find_rows(tracks.object_id)
     poses = torch.stack([states.x, states.y, states.z, states.heading], -1)[:, order].cpu().numpy()
-    history = slice(HISTORY_STEPS)
+    presence, history = states.presence[:, order].cpu().numpy(), slice(HISTORY_STEPS)
     index = {track: row for row, track in enumerate(simulated.tolist())}
     rows = [row for row, track in enumerate(scenario.tracks_to_predict.tolist()) if track in index]
     for number, future in enumerate(poses):  # [A, 80, 4]
@@ -45,7 +45,7 @@ def write_gpudrive(scenario: Scenario, states: SimulatedStates, folder: Path) ->
             heading=np.concatenate([tracks.heading[:, history], future[..., 3]], 1),
             velocity=np.concatenate([tracks.velocity[:, history], velocity], 1),
             size=np.repeat(tracks.size[:, HISTORY_STEPS - 1 : HISTORY_STEPS], position.shape[1], 1),
-            valid=np.pad(tracks.valid[:, history], ((0, 0), (0, future.shape[1])), constant_values=True),
+            valid=np.concatenate([tracks.valid[:, history], presence[number]], 1),
         )
         rollout = replace(
             scenario,

@@ -14,7 +14,9 @@ from rlftsim.goals.types import Goals
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, is_goal_conditioned
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import RolloutProvenance, Rollouts
@@ -23,7 +25,14 @@ from rlftsim.scenario.types import CURRENT_STEP
 
 
 def simulate_in_memory(
-    policy: Policy, batch: ScenarioBatch, num_rollouts: int, seed: int, sampling: Sampling, goals: Any
+    policy: Policy,
+    batch: ScenarioBatch,
+    num_rollouts: int,
+    seed: int,
+    num_steps: int,
+    sampling: Sampling,
+    goals: Any,
+    entries: EntryModel | None = None,
 ) -> Rollouts:
     """Rollouts of a batch with their provenance, simulated scenario by scenario.
 
@@ -32,13 +41,17 @@ def simulate_in_memory(
         batch: Scenarios to continue, on the policy's device.
         num_rollouts: Number N of rollouts of each scenario.
         seed: Seed of the rollouts.
+        num_steps: Number of simulated steps of 0.1 s.
         sampling: Temperature and truncation of the decisions.
         goals: Points, or goals of the whole batch, as for `rs.simulate`; None = goal-free.
+        entries: Model of who enters; the scenarios of the rollouts have visitors then. None = nobody enters or leaves.
 
     Raises:
         ConfigError: Goals of a wrong type, frame, batch or number of rollouts, or without effect on the policy.
         DataError: A goal of an agent that is not simulated, a goal out of reach, or not two finite numbers.
     """
+    if entries is not None:
+        batch = collate([add_visitors(scenario) for scenario in batch.scenarios], frame=batch.frame).to(batch.device)
     placed = _place_goals(goals, batch, num_rollouts)
     has_goals = placed.goal_mask.any(-1).any(-1).tolist()  # [B]
     if any(has_goals):  # else there may be no agent at all
@@ -57,8 +70,8 @@ def simulate_in_memory(
             scenario_goals = replace(placed, position=position, goal_mask=mask) if has_goals[row] else None
             simulated.append(
                 simulate(
-                    policy, scenario_batch, num_rollouts=num_rollouts, seed=seed, goals=scenario_goals,
-                    sampling=sampling,
+                    policy, scenario_batch, num_rollouts=num_rollouts, seed=seed, num_steps=num_steps,
+                    goals=scenario_goals, sampling=sampling, entries=entries,
                 )
             )  # fmt: skip
             advance()
@@ -73,8 +86,7 @@ def simulate_in_memory(
     )
     # All batches of one scenario are padded alike (`split`), so they can be joined along axis B.
     tensors = ("position", "heading", "decision", "decision_mask", "log_prob")
-    if simulated[0].draws is not None:
-        tensors = (*tensors, "draws")
+    tensors = (*tensors, *(name for name in ("draws", "valid") if getattr(simulated[0], name) is not None))
     joined = {name: torch.cat([getattr(rollouts, name) for rollouts in simulated]) for name in tensors}
     all_goals = placed.repeat(num_rollouts) if any(has_goals) else None
     return replace(simulated[0], **joined, goals=all_goals, provenance=provenance)
@@ -142,8 +154,10 @@ def score_in_memory(batch: ScenarioBatch, rollouts: Rollouts, metric: str, *, is
     states, config = states_of_rollouts(batch, rollouts), metric_by_name(metric)
     for scenario, simulated in zip(batch.scenarios, states):
         simulated.check_finite(scenario.scenario_id)
+    scored = score(batch.scenarios[0], states[0], config) if is_single else score_batch(batch.scenarios, states, config)
+    for scenario, simulated in zip(batch.scenarios, states):
         warn_of_doubts(scenario, simulated)
-    return score(batch.scenarios[0], states[0], config) if is_single else score_batch(batch.scenarios, states, config)
+    return scored
 
 
 def _match_batch(batch: ScenarioBatch, rollouts: Rollouts) -> ScenarioBatch:

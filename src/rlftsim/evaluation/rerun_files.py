@@ -8,7 +8,15 @@ import torch
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.files import write_atomically
 from rlftsim.realism import SimulatedStates, compute_features, scenario_log
-from rlftsim.scenario.types import HISTORY_STEPS, LANE_TYPES, ROAD_EDGE_TYPES, LightState, ObjectType, Scenario
+from rlftsim.scenario.types import (
+    FUTURE_STEPS,
+    HISTORY_STEPS,
+    LANE_TYPES,
+    ROAD_EDGE_TYPES,
+    LightState,
+    ObjectType,
+    Scenario,
+)
 
 MAX_ROLLOUTS = 8
 """Rollouts in a recording."""
@@ -47,6 +55,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
     tracks, origin = scenario.tracks.select(scenario.simulated_indices), np.append(scenario.origin, 0.0)
     order = states.find_rows(tracks.object_id)
     future = torch.stack([states.x, states.y, states.z, states.heading], -1)[:MAX_ROLLOUTS, order].cpu().numpy()
+    presence = states.presence[:, order].cpu().numpy()
     log = np.concatenate([tracks.position, tracks.heading[..., None]], -1)
     size = tracks.size[:, HISTORY_STEPS - 1]
     colors = np.array([TYPE_COLORS.get(ObjectType(value), OTHER_COLOR) for value in tracks.object_type])
@@ -80,7 +89,9 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
             stream.log("lights", rr.Points3D(scenario.lights.stop_point[is_now] - origin, colors=lights, radii=0.6))
             for number, rollout in enumerate(future):
                 if step >= HISTORY_STEPS:
-                    log_boxes(f"rollout_{number}", rollout[:, step - HISTORY_STEPS], np.ones(len(size), bool))
+                    log_boxes(
+                        f"rollout_{number}", rollout[:, step - HISTORY_STEPS], presence[number, :, step - HISTORY_STEPS]
+                    )
         for name, fractions in _measure_events(scenario, states).items():
             for number, values in enumerate(fractions):
                 for step, value in enumerate(values, HISTORY_STEPS):
@@ -94,7 +105,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
 
 def _measure_events(scenario: Scenario, states: SimulatedStates) -> dict[str, np.ndarray]:
     """Fraction of evaluated agents that collide, or are off the road, at each step of the first rollouts, [N, T]."""
-    if not scenario.has_evaluated_future:
+    if not scenario.has_evaluated_future or states.x.shape[-1] != FUTURE_STEPS:
         return {}
     features = compute_features(scenario_log(scenario, states.device, missing_map="neutral"), states)
     events = {"collision": features.collision, "off_road": features.offroad}

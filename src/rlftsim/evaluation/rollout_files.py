@@ -79,18 +79,22 @@ def find_rollouts(source: str | PathLike[str]) -> list[RolloutEntry]:
     return [entry for path in files for entry in _list_entries(path)]
 
 
-def read_states(entry: RolloutEntry) -> SimulatedStates:
+def read_states(entry: RolloutEntry, num_steps: int | None = FUTURE_STEPS) -> SimulatedStates:
     """Rollouts of a scenario, checked to be finite numbers within `MAX_COORDINATE_M` of the origin.
+
+    Args:
+        entry: Location of the rollouts.
+        num_steps: Number of steps that the rollouts must have, by default those of the metric; None = any.
 
     Raises:
         DataError: Wrong shapes, keys or numbers of steps, agents that differ between rollouts, values that are no
             numbers or out of range; the message names the file and the scenario.
     """
     try:
-        states = _states_of_npz(entry) if entry.format == "npz" else _states_of_submission(entry)
+        states = _states_of_npz(entry, num_steps) if entry.format == "npz" else _states_of_submission(entry)
         states.check_finite()
         for axis in AXES[:3]:
-            values = getattr(states, axis)  # [N, A, 80]
+            values = getattr(states, axis)  # [N, A, T]
             outliers = (values.abs() > MAX_COORDINATE_M).nonzero()
             if len(outliers):
                 rollout, agent, step = outliers[0].tolist()
@@ -155,8 +159,9 @@ def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:
+def _states_of_npz(entry: RolloutEntry, num_steps: int | None) -> SimulatedStates:
     arrays = _read_npz(entry.file, _KEYS[1:])
+    valid = read_npz(entry.file, ("valid",), "write it again").get("valid")
     ids = arrays.pop("object_ids")
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise DataError(f"object_ids must be whole numbers [A], got {ids.dtype} {list(ids.shape)}.")
@@ -164,20 +169,23 @@ def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:
     if (counts > 1).any():
         repeated = ", ".join(map(str, unique[counts > 1][:8]))
         raise DataError(f"object_ids must differ: {repeated} listed twice.")
-    expected = (len(ids), FUTURE_STEPS)  # of [N, A, 80] without N
+    expected = (len(ids), *(arrays["x"].shape[2:] if num_steps is None else [num_steps]))  # of [N, A, T] without N
     for axis, values in arrays.items():
         if values.dtype.kind != "f" or values.ndim != 3 or values.shape[1:] != expected or not len(values):
             raise DataError(
-                f"{axis} must be floats [N, A, {FUTURE_STEPS}] with A = {len(ids)} as in object_ids, "
+                f"{axis} must be floats [N, A, {num_steps or 'T'}] with A = {len(ids)} as in object_ids, "
                 f"got {values.dtype} {list(values.shape)}."
             )
     numbers = [len(values) for values in arrays.values()]
     if len(set(numbers)) > 1:
         text = ", ".join(map(str, numbers))
         raise DataError(f"x, y, z and heading hold {text} rollouts: there must be equally many.")
+    if valid is not None and (valid.dtype.kind != "b" or valid.shape != arrays["x"].shape):
+        raise DataError(f"valid must be true or false in the shape of x, got {valid.dtype} {list(valid.shape)}.")
     with np.errstate(over="ignore"):  # what becomes infinite is refused by name
         x, y, z, heading = (torch.from_numpy(np.ascontiguousarray(arrays[axis], np.float32)) for axis in AXES)
-    return SimulatedStates(ids.astype(np.int64), x, y, z, heading)
+    presence = None if valid is None else torch.from_numpy(valid)
+    return SimulatedStates(ids.astype(np.int64), x, y, z, heading, valid=presence)
 
 
 def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:

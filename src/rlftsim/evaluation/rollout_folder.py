@@ -17,7 +17,9 @@ from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Runner
+from rlftsim.rollout.entries import identify_entries, load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.rollout.types import write_rollouts
@@ -37,11 +39,14 @@ class Simulation:
     scenario_ids: Sequence[str]
     """In the order of the work."""
     num_rollouts: int
+    num_steps: int
     seed: int
     sampling: Sampling
     goals: GoalsFile
     model: str
     """Name of the model, for people who read the description."""
+    entries: str | None = None
+    """Name or file of the model of who enters; None = nobody enters or leaves."""
 
     def describe(self) -> dict[str, Any]:
         """Values on which the rollouts depend, in types of JSON, and the name of the model, which may change."""
@@ -51,10 +56,12 @@ class Simulation:
             "data": self.dataset.fingerprint,
             "seed": self.seed,
             "num_rollouts": self.num_rollouts,
+            "num_steps": self.num_steps,
             "sampling": asdict(self.sampling),
         }
         entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
-        return identity | ({"goals": entries} if entries else {})
+        entering = {} if self.entries is None else {"entries": identify_entries(self.entries)}
+        return identity | ({"goals": entries} if entries else {}) | entering
 
 
 def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> list[Path]:
@@ -73,7 +80,7 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
     """
     check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
     identity = simulation.describe()
-    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_validate_file, simulation.num_rollouts))
+    rollouts = WholeFiles[str](out, "{}.npz".format, partial(_validate_file, simulation))
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
@@ -87,15 +94,15 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
     return paths
 
 
-def _validate_file(num_rollouts: int, path: Path) -> Path:
+def _validate_file(simulation: Simulation, path: Path) -> Path:
     """The file of a scenario; checksums, types and shapes of its arrays are right.
 
     Raises:
         DataError: Damaged file, or other rollouts than those of the scenario that the file is named after.
     """
-    states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == path.stem]
-    if [len(rollouts.x) for rollouts in states] != [num_rollouts]:
-        raise DataError(f"{path}: it holds other rollouts than {num_rollouts} of its scenario.")
+    entries = [entry for entry in find_rollouts(path) if entry.scenario_id == path.stem]
+    if [len(read_states(entry, simulation.num_steps).x) for entry in entries] != [simulation.num_rollouts]:
+        raise DataError(f"{path}: it holds other rollouts than {simulation.num_rollouts} of its scenario.")
     return path
 
 
@@ -105,11 +112,14 @@ def _simulate_scenario(
     """File with the rollouts of a scenario, written now; None where the work is being stopped."""
     if is_stopped():
         return None
-    batch = collate([simulation.dataset.by_id(scenario_id)]).to(get_device(simulation.policy))
+    scenario, name = simulation.dataset.by_id(scenario_id), simulation.entries
+    batch = collate([scenario if name is None else add_visitors(scenario)]).to(get_device(simulation.policy))
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
-        sampling=simulation.sampling, goals=goals_of_batch(entries, batch) if entries else None,
+        num_steps=simulation.num_steps, sampling=simulation.sampling,
+        goals=goals_of_batch(entries, batch) if entries else None,
+        entries=None if name is None else load_entries(name),
     )  # fmt: skip
     [path] = write_rollouts(out, batch, rollouts)
     advance(1)

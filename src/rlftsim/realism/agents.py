@@ -26,8 +26,8 @@ NUM_HISTORY_STEPS = 2
 class SimulatedStates:
     """Future states of a scenario's simulated agents in N rollouts, world frame, float32, on a single device.
 
-    Every agent exists at all T = 80 steps, or T = 91 of a generated scene. Agents may come in any order, named by
-    `object_id`.
+    Every agent exists at all T steps: 80 where they are scored, 91 of a generated scene. Agents may come in any order,
+    named by `object_id`.
     """
 
     object_id: Int[np.ndarray, "A"]
@@ -40,10 +40,12 @@ class SimulatedStates:
     """Number of identical rollouts behind each row: 32 equal rollouts are scored at the cost of a single rollout."""
     size: Float[Tensor, "N A T 3"] | None = None
     """Length, width, height of generated agents, m; None = agents go on from the log, with the sizes there."""
+    valid: Bool[Tensor, "N A T"] | None = None
+    """True = the agent is there, in a world that agents enter and leave, which is not scored; None = everybody is."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
-        num_steps = self.challenge.num_steps
+        num_steps = self.x.shape[-1] if self.size is None else SCENARIO_GEN.num_steps
         expected_shape = (*self.x.shape[:1], len(self.object_id), num_steps)
         if self.size is not None and tuple(self.size.shape) != (*expected_shape, 3):
             raise DataError(f"Sizes of generated agents must be {[*expected_shape, 3]}, got {list(self.size.shape)}.")
@@ -56,6 +58,11 @@ class SimulatedStates:
                 )
         if self.repeat < 1 or expected_shape[0] < 1:
             raise DataError(f"At least one rollout is needed, got {expected_shape[0]} x repeat {self.repeat}.")
+
+    @property
+    def presence(self) -> Bool[Tensor, "N A T"]:
+        """True = the agent is there."""
+        return torch.ones_like(self.x, dtype=torch.bool) if self.valid is None else self.valid
 
     @property
     def challenge(self) -> Challenge:
@@ -317,10 +324,10 @@ def join_history(
     Raises:
         DataError: The agents of the rollouts are not those of the scenario, or the steps those of another challenge.
     """
-    if states.challenge != agents.challenge:
+    if states.challenge != agents.challenge or states.x.shape[-1] != agents.challenge.num_steps:
         raise DataError(
             f"scenario {scenario_id}: {agents.challenge.title} scores {agents.challenge.num_steps} steps of an agent, "
-            f"and these rollouts have the {states.challenge.num_steps} of {states.challenge.title}: name a metric of "
+            f"and these rollouts have {states.x.shape[-1]} in the form of {states.challenge.title}: name a metric of "
             "that challenge; `rlftsim evaluate` makes the rollouts that its metric wants."
         )
     order = match_agents(agents.object_id, states.object_id, scenario_id)

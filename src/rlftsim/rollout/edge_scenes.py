@@ -1,12 +1,12 @@
 """Variants of a scenario that policies must handle: moved, emptied, crowded, with agents that appear late."""
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rlftsim.geometry import wrapped
-from rlftsim.scenario.types import CURRENT_STEP, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
 
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
 """53.13 degrees: sine 4/5 and cosine 3/5 are short fractions, so rotated grid points stay exact in float32."""
@@ -54,10 +54,7 @@ def _move_points(scenario: Scenario, transform: Callable[[np.ndarray], np.ndarra
 
 def without_future(scenario: Scenario) -> Scenario:
     """The same scenario as in a test split: tracks and lights end at the current step."""
-    times, tracks, lights, end = scenario.timestamps_s, scenario.tracks, scenario.lights, CURRENT_STEP + 1
-    cut = {name: getattr(tracks, name)[:, :end] for name in ("position", "heading", "velocity", "size", "valid")}
-    history = {field.name: getattr(lights, field.name)[lights.step < end] for field in fields(lights)}
-    return replace(scenario, timestamps_s=times[:end], tracks=replace(tracks, **cut), lights=LightStates(**history))
+    return scenario.window(0, HISTORY_STEPS)
 
 
 def place_on_grid(scenario: Scenario) -> Scenario:

@@ -1,6 +1,8 @@
-"""The closed loop: a policy decides, all agents move, and so on for eight seconds."""
+"""The closed loop: a policy decides, all agents move, and so on for eight seconds or any other time."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,12 +12,16 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
+from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.open_world import OpenWorld
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import FUTURE_STEPS, Scenarios
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, Scenarios
 
+RELIT_STEPS = 20
+"""After the metric's 8 s agents see the lights of the log, anew every 2 s; within these they see those of "now"."""
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]
 Observe = Callable[[Float[Tensor, "B N A t 3"]], None]
@@ -29,11 +35,13 @@ def simulate(
     *,
     num_rollouts: int | range,
     seed: int,
+    num_steps: int = FUTURE_STEPS,
     context: Any = None,
     goals: Goals | None = None,
     sampling: Sampling = Sampling(),  # noqa: B008
     choose: Choose | None = None,
     force: Force | None = None,
+    entries: EntryModel | None = None,
     observe: Observe | None = None,
     may_be_nan: bool = False,
 ) -> Rollouts:
@@ -45,12 +53,16 @@ def simulate(
         num_rollouts: Number N of futures, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether
             drawn alone or among 32.
         seed: Seed of the noise, the only random input of the rollouts.
+        num_steps: Number of simulated steps T of 0.1 s; 80 are those of the metric. A longer rollout begins with the
+            same states as a shorter one.
         context: Result of an earlier `policy.encode(batch)`; None = encode here.
         goals: Goals of agents in each of the N rollouts, or in a single rollout to be repeated; None = goal-free.
         sampling: Temperature and truncation of every draw.
         choose: Function that picks decisions from a distribution, such as CAT-K's closest among the top K; None = draw.
         force: Function called before every advance with the state and the step that the decision starts at; may impose
             states on agents.
+        entries: Model of who enters, for a single scenario with visitors (`open_world.add_visitors`); agents leave,
+            too. Takes the place of `force`. None = nobody enters or leaves.
         observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error ends
             the simulation.
         may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
@@ -59,30 +71,38 @@ def simulate(
         Poses, decisions and log-probabilities, under the distribution that was sampled from.
 
     Raises:
-        ConfigError: There are no rollouts, or the length of a decision does not divide the 80 steps.
+        ConfigError: There are no rollouts, the length of a decision does not divide the steps, or goals, which are due
+            after 8 s, in rollouts of another length; or entries that do not fit policy or batch, see `OpenWorld`.
         DataError: Log-probabilities are NaN, as with weights that are NaN; the scenario is named.
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
     stride = policy.steps_per_decision
-    if len(rollout_ids) < 1 or FUTURE_STEPS % stride:
+    if len(rollout_ids) < 1 or num_steps < 1 or num_steps % stride or FUTURE_STEPS % stride:
         raise ConfigError(
-            f"cannot simulate {len(rollout_ids)} rollouts with {stride} steps per decision: "
-            "need >= 1 and a divisor of 80."
+            f"cannot simulate {len(rollout_ids)} rollouts of {num_steps} steps with {stride} steps per decision: "
+            f"need >= 1, and a divisor of {num_steps} and of {FUTURE_STEPS}."
         )
-    num_decisions = FUTURE_STEPS // stride
+    if goals is not None and num_steps != FUTURE_STEPS:
+        raise ConfigError(
+            f"goals are due after {FUTURE_STEPS} steps, not after {num_steps}: simulate 8 seconds, or leave goals out."
+        )
+    num_decisions = num_steps // stride
+    world = None if entries is None else OpenWorld(batch, rollout_ids, seed, stride, entries)
+    force = force if world is None else world.force
     goals = goals and goals.repeat(len(rollout_ids))
 
-    # 1. all noise at once: it depends on seed, scenario and rollout id alone
+    # 1. noise depends on seed, scenario and rollout id alone
     initial = draw_noise(batch, rollout_ids, seed=seed, purpose="begin", per_agent=policy.initial_noise_size)
-    noise = draw_noise(batch, rollout_ids, seed=seed, purpose="decide", per_agent=num_decisions * policy.noise_size)
-    noise = noise.unflatten(-1, (num_decisions, -1))  # [B, N, A, L, noise]
+    noise = _draw_decision_noise(policy, batch, rollout_ids, seed)
 
     # 2. the loop
     context = policy.encode(batch) if context is None else context
     state = policy.begin(context, len(rollout_ids), goals, initial)
     draws = state.draws
     poses, decisions, log_probs, forced_states, masks = [], [], [], [], []
-    for step, decision_noise in zip(range(0, FUTURE_STEPS, stride), noise.unbind(-2)):
+    for step, decision_noise in zip(range(0, num_steps, stride), noise):
+        if step >= FUTURE_STEPS and step % RELIT_STEPS == 0 and _changes_lights(batch, CURRENT_STEP + step):
+            context = policy.encode(replace(batch, light_step=CURRENT_STEP + step))
         distribution = policy.decide(context, state)
         arguments = (sampling, decision_noise)
         decision = choose(distribution, state, *arguments) if choose else distribution.sample(*arguments)
@@ -98,7 +118,7 @@ def simulate(
 
     # 3. one value. A decision counts unless the agent is padding, decides nothing any more or was forced through all of
     #    the decision's steps
-    path = torch.cat(poses, dim=3)  # [B, N, A, 80, 3]
+    path = torch.cat(poses, dim=3)  # [B, N, A, T, 3]
     all_forced = _join_states(forced_states, path)
     present = batch.agent_mask[:, None].expand(path.shape[:3])  # [B, N, A]
     mask = torch.stack([present if decides is None else present & decides for decides in masks], 3)  # [B, N, A, L]
@@ -113,7 +133,27 @@ def simulate(
             "again if they diverged, or leave out a scenario with extreme values."
         )
     decision = torch.stack(decisions, dim=3)
-    return Rollouts(path[..., :2], path[..., 2], decision, mask, log_prob, draws=draws, goals=goals, forced=all_forced)
+    valid = None if world is None else world.valid.to(batch.device)
+    return Rollouts(
+        path[..., :2], path[..., 2], decision, mask, log_prob, draws=draws, goals=goals, forced=all_forced, valid=valid
+    )
+
+
+def _changes_lights(batch: ScenarioBatch, step: int) -> bool:
+    """True where a log still has traffic lights at a step, which are no more than a signal plan to the agents."""
+    return any(len(s.lights.step) and step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
+
+
+def _draw_decision_noise(
+    policy: Policy, batch: ScenarioBatch, rollout_ids: range, seed: int
+) -> Iterator[Float[Tensor, "B N A noise"]]:
+    """Noise of one decision after the other, drawn for 8 s at once, so that it depends on no rollout's length."""
+    per_block = FUTURE_STEPS // policy.steps_per_decision
+    for block in itertools.count():
+        purpose = f"decide after block {block}" if block else "decide"
+        per_agent = per_block * policy.noise_size
+        noise = draw_noise(batch, rollout_ids, seed=seed, purpose=purpose, per_agent=per_agent)
+        yield from noise.unflatten(-1, (per_block, -1)).unbind(-2)
 
 
 def check_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:

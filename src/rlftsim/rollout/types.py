@@ -23,6 +23,9 @@ from rlftsim.jobs.files import write_atomically
 from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, render_html
 
+FARTHEST_STEP_M = 30.0
+"""No agent moves so far in 0.1 s: one that is imposed farther away is somebody else, and has no past."""
+
 
 @dataclass(frozen=True, eq=False)
 class AgentStates:
@@ -114,6 +117,8 @@ class Rollouts:
     """[B, N, ...] drawn once per rollout by the policy, opaque to all other code."""
     goals: Goals | None = None
     forced: AgentStates | None = None
+    valid: Bool[Tensor, "B N A T"] | None = None
+    """True = the agent is there, in a world that agents enter and leave; None = everybody is, all the time."""
     provenance: RolloutProvenance | None = None
     """Set by `rlftsim.simulate`; None for rollouts of the closed loop itself, as in training."""
 
@@ -138,6 +143,7 @@ class Rollouts:
             goals=None if self.goals is None else self.goals.rollouts(selected),
             draws=None if self.draws is None else self.draws[:, selected],
             forced=None if self.forced is None else self.forced.rollouts(selected),
+            valid=None if self.valid is None else self.valid[:, selected],
         )
 
     def select_scenario(self, row: int, num_agents: int) -> "Rollouts":
@@ -154,6 +160,8 @@ class Rollouts:
             position, mask = (tensor[row : row + 1, :, :num_agents] for tensor in (goals.position, goals.goal_mask))
             goals = replace(goals, position=position, goal_mask=mask)
         draws = None if self.draws is None else self.draws[row : row + 1]
+        if self.valid is not None:
+            values["valid"] = self.valid[row : row + 1, :, :num_agents]
         return replace(self, **values, draws=draws, goals=goals, forced=None)
 
     # ---- agents by object id: rollouts that `rlftsim.simulate` returned ------------------------------------------
@@ -245,7 +253,8 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
         x, y = (world[b, :, : len(indices), :, axis] for axis in range(2))
         z = np.broadcast_to(heights[b, : len(indices), None], heading.shape)
         ids = {"scenario_id": np.array(scenario.scenario_id), "object_ids": scenario.tracks.object_id[indices]}
-        write_atomically(file, partial(_write_npz, **ids, x=x, y=y, z=z, heading=heading))
+        presence = {} if rollouts.valid is None else {"valid": rollouts.valid[b, :, : len(indices)].cpu().numpy()}
+        write_atomically(file, partial(_write_npz, **ids, **presence, x=x, y=y, z=z, heading=heading))
     return files
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, Scenario
 
 Frame = Literal["map", "world"]
 
@@ -39,6 +39,8 @@ class ScenarioBatch:
     """Length, width, height at the current step."""
     valid: Bool[Tensor, "B A S"]
     frame: Frame = "map"
+    light_step: int = CURRENT_STEP
+    """Step of the log whose traffic lights are seen; the last one where a log ends before."""
 
     @property
     def num_scenarios(self) -> int:
@@ -58,6 +60,11 @@ class ScenarioBatch:
         """
         # added in float64, so that only the result is rounded
         return (position.double() + self.origin[:, None, None, None].to(position.device)).float()
+
+    def history(self) -> "ScenarioBatch":
+        """The same batch with tensors that end at the current step."""
+        names = ("position", "z", "heading", "velocity", "valid")
+        return replace(self, **{name: getattr(self, name)[:, :, :HISTORY_STEPS] for name in names})
 
     def to(self, device: torch.device | str) -> "ScenarioBatch":
         """The same batch on another device."""

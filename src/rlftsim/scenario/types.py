@@ -4,8 +4,8 @@ Units: meters, seconds, radians, meters per second. Headings are counter-clockwi
 the log. Coordinates are float32 from reading on, because the official evaluator and the public SMART code round them
 first. The exception is `MapFeatures.polygon_rest`. `Scenario.origin` is in whole meters: subtraction is exact.
 
-Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Torch is not
-needed.
+Shapes: O objects, S steps at 10 Hz (91 or more; 11 in a test split), F map features, P map points, K light states.
+Torch is not needed.
 """
 
 import re
@@ -18,12 +18,13 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, get_args, run
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64, Shaped
 
-from rlftsim.errors import DataError, in_short
+from rlftsim.errors import ConfigError, DataError, in_short
 from rlftsim.jobs.documents import MAX_NAME_BYTES
 
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
+MAX_SECONDS = 86_400.0
 TIME_TOLERANCE_S = STEP_S / 2
 """A timestamp may be so far from its multiple of 0.1 s: in 9 s the clocks of real logs drift by up to 0.022 s, and
 their steps differ by up to 0.011 s."""
@@ -31,6 +32,23 @@ HISTORY_STEPS = 11
 CURRENT_STEP = 10
 FUTURE_STEPS = 80
 TOTAL_STEPS = 91
+
+
+def count_steps(seconds: float) -> int:
+    """Number of steps of 0.1 s in a time.
+
+    Args:
+        seconds: Time in seconds, a multiple of 0.1 above zero.
+
+    Raises:
+        ConfigError: A time that is no such multiple.
+    """
+    steps = round(seconds / STEP_S) if 0 < seconds < MAX_SECONDS else 0
+    if steps < 1 or abs(steps * STEP_S - seconds) > 1e-6:
+        raise ConfigError(
+            f"seconds must be a multiple of {STEP_S:g} above 0 and below {MAX_SECONDS:g}, got {in_short(seconds)}."
+        )
+    return steps
 
 
 class ObjectType(IntEnum):
@@ -403,14 +421,31 @@ class Scenario:
                     f"{name} {distant[0]} is at ({x:g}, {y:g}, {z:g}) m, too far out for float32: {way_out}"
                 )
 
+    def window(self, start: int, num_steps: int = TOTAL_STEPS) -> "Scenario":
+        """Some steps of the log as a scenario, in which "now" is ten steps after the first.
+
+        Args:
+            start: First step of the window.
+            num_steps: Length of the window; it ends earlier where the log does. 11 withhold the future.
+        """
+        steps, lights = slice(start, start + num_steps), self.lights
+        is_inside = (lights.step >= start) & (lights.step < start + num_steps)
+        observed = {column.name: getattr(lights, column.name)[is_inside] for column in fields(lights)}
+        return replace(
+            self,
+            timestamps_s=self.timestamps_s[steps],
+            tracks=self.tracks.cut(steps),
+            lights=LightStates(**observed | {"step": observed["step"] - observed["step"].dtype.type(start)}),
+        )
+
     @property
     def num_steps(self) -> int:
-        """91, or 11 where the future is withheld."""
+        """91 of the Waymo dataset, more of a longer log, or 11 where the future is withheld."""
         return self.tracks.valid.shape[1]
 
     @property
     def has_future(self) -> bool:
-        """True where the log has the 80 future steps."""
+        """True where the log has the 80 future steps of the metric, or more."""
         return self.num_steps >= TOTAL_STEPS
 
     @property

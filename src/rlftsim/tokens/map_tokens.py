@@ -4,7 +4,7 @@ M map tokens. The rules (polylines, types, 5 m windows) are those of the public 
 three points are AlpaSim's, whose maps are cut by its rules (`catk/map_adapter.py` there): pieces of 8 m.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -63,6 +63,8 @@ class MapSegments:
     """0 lane, 1 road edge, 2 road line, 3 polygon."""
     light: Int8[np.ndarray, "M"]
     """Traffic light of the lane at the current step: 0 none, 1 unknown, 2 stop, 3 go, 4 caution."""
+    lane_id: Int64[np.ndarray, "M"]
+    """Feature id of the lane; -1 = no lane."""
     windows: Float32[np.ndarray, "W 11 2"]
     """The whole 5 m windows, each in its own frame (start at the origin, heading 0): the data of the prototypes."""
 
@@ -90,6 +92,8 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V n 2"]) -> Ma
     """
     num_points = prototypes.shape[1]
     maps = [split_map(scenario, num_points) for scenario in batch.scenarios]
+    if batch.light_step != CURRENT_STEP:
+        maps = [_relight(pieces, scenario, batch.light_step) for pieces, scenario in zip(maps, batch.scenarios)]
 
     def pad(arrays: list[np.ndarray], dtype: torch.dtype) -> Tensor:
         return pad_sequence([torch.from_numpy(array).to(dtype) for array in arrays], batch_first=True).to(batch.device)
@@ -129,12 +133,11 @@ def split_map(scenario: Scenario, num_points: int = WINDOW) -> MapSegments:
     order = [(int(i), family) for family, types in enumerate(families) for i in features.find_indices(types)]
     stop_lanes = set(features.topology.stop_sign_lanes[:, 1].tolist())
     # 2. Light of each lane at the current step; of a lane that is listed twice, the last one.
-    is_current = scenario.lights.step == CURRENT_STEP
-    states = (_STATE_TO_LIGHT.get(LightState(s), 1) for s in scenario.lights.state[is_current].tolist())
-    lights = dict(zip(scenario.lights.lane_id[is_current].tolist(), states))
+    lights = _find_lights(scenario, CURRENT_STEP)
     # 3. Pieces of each polyline, with labels for each piece: type, family, light.
     groups: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     labels: list[np.ndarray] = []
+    lanes: list[np.ndarray] = []
     for index, family in order:
         polyline = features.polyline(index)
         if len(polyline) < 2:
@@ -149,13 +152,27 @@ def split_map(scenario: Scenario, num_points: int = WINDOW) -> MapSegments:
         groups.append((_cut if num_points == WINDOW else _cut_triples)(polyline[:, :2]))
         label = [type_, family, lights.get(lane_id, 0) if family == 0 else 0]
         labels.append(np.tile(np.array(label, np.int8), (len(groups[-1][1]), 1)))
+        lanes.append(np.full(len(groups[-1][1]), lane_id if family == 0 else -1))
     if not sum(map(len, labels)):
         zeros, position = np.zeros(1, np.int8), np.full((1, 3, 2), NO_MAP_POSITION_M, np.float32)
         no_windows = np.zeros((0, WINDOW, 2), np.float32)
-        return MapSegments(position, np.zeros(1, np.float32), zeros, zeros, zeros, no_windows)
+        return MapSegments(position, np.zeros(1, np.float32), zeros, zeros, zeros, np.full(1, -1), no_windows)
     points, heading, windows = (np.concatenate(columns) for columns in zip(*groups))
     type_, family, light = np.concatenate(labels).T
-    return MapSegments(points, heading, type_, family, light, windows)
+    return MapSegments(points, heading, type_, family, light, np.concatenate(lanes), windows)
+
+
+def _find_lights(scenario: Scenario, step: int) -> dict[int, int]:
+    """Light of each lane that has a light at a step."""
+    is_current = scenario.lights.step == step
+    states = (_STATE_TO_LIGHT.get(LightState(s), 1) for s in scenario.lights.state[is_current].tolist())
+    return dict(zip(scenario.lights.lane_id[is_current].tolist(), states))
+
+
+def _relight(pieces: MapSegments, scenario: Scenario, step: int) -> MapSegments:
+    """The pieces with the lights of another step, at most the last of the log."""
+    lights = _find_lights(scenario, min(step, scenario.num_steps - 1))
+    return replace(pieces, light=np.array([lights.get(lane, 0) for lane in pieces.lane_id.tolist()], np.int8))
 
 
 def _polygon_sides(polygon: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:

@@ -13,7 +13,7 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.mirror import mirror_scenario
-from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios, cached_on_scenario
+from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, Scenario, Scenarios, cached_on_scenario
 
 MIN_FUTURE_STEPS = 5
 """Logged steps after the current one that an agent needs to be learned from."""
@@ -22,7 +22,7 @@ MIN_FUTURE_STEPS = 5
 def batch_with_futures(
     scenarios: Scenarios, indices: Sequence[int], *, context_radius_m: float | None = None, mirror: Collection[int] = ()
 ) -> ScenarioBatch:
-    """Batch of some scenarios.
+    """Batch of some scenarios; of a log longer than 9.1 s the first 9.1 s.
 
     Args:
         scenarios: Training scenarios, which the indices count.
@@ -34,6 +34,7 @@ def batch_with_futures(
         DataError: a scenario withholds the future, so the model cannot learn from the scenario.
     """
     selected = [mirror_scenario(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
+    selected = [_first_window(scenario) or scenario for scenario in selected]
     for scenario in selected:
         if not scenario.has_future:
             raise DataError(
@@ -43,6 +44,12 @@ def batch_with_futures(
     if context_radius_m is not None:
         selected = [within_reach(scenario, context_radius_m) for scenario in selected]
     return collate(selected)
+
+
+@cached_on_scenario
+def _first_window(scenario: Scenario) -> Scenario | None:
+    """First 9.1 s of a longer log; None where the log is no longer, as in `_without_far_steps`."""
+    return scenario.window(0) if scenario.num_steps > TOTAL_STEPS else None
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:

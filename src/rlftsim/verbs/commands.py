@@ -150,6 +150,11 @@ VERBS = {
         "roll out scenarios with a model",
         Command("simulate:simulate", ("policy",), ("out",), {**MODEL, **DATA}, "print_rollouts", has_shares=True),
     ),
+    "entries": Verb(
+        "learn from long logs who enters a world",
+        {"fit": Command("entries:fit", ("data", "out"))},
+        "Learn from long logs who enters a world.", starts_anew=True,
+    ),
     "export": Verb(
         "write stored rollouts as files that other programs read",
         Command("export:export", ("exporter", "rollouts", "out"), ("scenarios",), {"exporter": "FORMAT"}),

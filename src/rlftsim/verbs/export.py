@@ -4,7 +4,7 @@ from os import PathLike
 from pathlib import Path
 from typing import cast
 
-from rlftsim.evaluation.exporters import exporter_by_name, read_rollouts
+from rlftsim.evaluation.exporters import exporter_by_name, read_rollouts, with_entrants
 from rlftsim.evaluation.rollout_files import find_rollouts
 from rlftsim.evaluation.scenario_source import open_scenarios
 from rlftsim.jobs.files import errors_name
@@ -34,4 +34,5 @@ def export(exporter: str, rollouts: Path, out: Path, *, scenarios: Name) -> None
         out.mkdir(parents=True, exist_ok=True)
     for entry in entries:
         scenario = source.by_id(entry.scenario_id)
-        print_line(write(scenario, read_rollouts(entry, scenario), out))
+        states = read_rollouts(entry, scenario)
+        print_line(write(with_entrants(scenario, states), states, out))

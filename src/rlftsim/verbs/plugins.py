@@ -19,6 +19,7 @@ POINTS = {
     "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
     "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
     "rlftsim.trackers": "rlftsim.training.trackers:TRACKERS",
+    "rlftsim.entries": "rlftsim.rollout.entries:ENTRIES",
     "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",
 }
 """Entry-point group -> module and name of its `ExtensionPoint`."""

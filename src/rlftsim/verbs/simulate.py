@@ -14,10 +14,12 @@ from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
 from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work, check_jobs, choose_runner
 from rlftsim.policies.registry import with_guidance
+from rlftsim.rollout.entries import load_entries
 from rlftsim.rollout.policy import Sampling, frozen_copy, get_device, is_training
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset, to_scenarios
+from rlftsim.scenario.types import count_steps
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goals import check_goal_effects, check_scenarios, read_given_goals
 from rlftsim.verbs.inputs import check_left_out, to_batch, to_policy, to_sampling, with_checked_arguments
@@ -28,16 +30,17 @@ IN_FILES = ("scenario", "limit", "goal", "picture", "export", "jobs", "work")
 
 @overload
 def simulate(
-    policy: Model, scenarios: Data, *, num_rollouts: int = ..., seed: int = ..., goals: GoalPoints | None = ...,
-    sampling: Sampling | None = ..., out: None = ..., split: str = ..., guidance_scale: float = ...,
-    device: Device = ...,
+    policy: Model, scenarios: Data, *, num_rollouts: int = ..., seed: int = ..., seconds: float = ...,
+    entries: str | None = ..., goals: GoalPoints | None = ..., sampling: Sampling | None = ..., out: None = ...,
+    split: str = ..., guidance_scale: float = ..., device: Device = ...,
 ) -> Rollouts: ...  # fmt: skip
 @overload
 def simulate(
-    policy: Model, scenarios: Data, *, num_rollouts: int = ..., seed: int = ..., goals: GoalPoints | None = ...,
-    sampling: Sampling | None = ..., out: File, split: str = ..., scenario: list[str] | None = ...,
-    limit: int | None = ..., goal: tuple[str, ...] = ..., guidance_scale: float = ..., picture: bool = ...,
-    export: tuple[str, ...] = ..., device: Device = ..., jobs: int = ..., work: Work = ...,
+    policy: Model, scenarios: Data, *, num_rollouts: int = ..., seed: int = ..., seconds: float = ...,
+    entries: str | None = ..., goals: GoalPoints | None = ..., sampling: Sampling | None = ..., out: File,
+    split: str = ..., scenario: list[str] | None = ..., limit: int | None = ..., goal: tuple[str, ...] = ...,
+    guidance_scale: float = ..., picture: bool = ..., export: tuple[str, ...] = ..., device: Device = ...,
+    jobs: int = ..., work: Work = ...,
 ) -> list[Path]: ...  # fmt: skip
 @with_checked_arguments
 def simulate(
@@ -46,6 +49,8 @@ def simulate(
     *,
     num_rollouts: int = 32,
     seed: int = 0,
+    seconds: float = 8.0,
+    entries: str | None = None,
     goals: GoalPoints | None = None,
     sampling: Sampling | None = None,
     out: File | None = None,
@@ -60,12 +65,12 @@ def simulate(
     jobs: int = 1,
     work: Work = Work(),  # noqa: B008
 ) -> Rollouts | list[Path]:
-    """Simulate futures of scenarios: the model moves every agent, the ego included, for 8 seconds.
+    """Simulate futures of scenarios: the model moves every agent, the ego included.
 
     The same seed gives the same rollouts in Python and on the command line, whatever other scenarios are simulated
     with one.
 
-    Writes one npz file per scenario: scenario_id, object_ids [A], x y z heading [N, A, 80], world frame. Existing files
+    Writes one npz file per scenario: scenario_id, object_ids [A], x y z heading [N, A, T], world frame. Existing files
     are kept, so an interrupted simulation continues when the same command is repeated; one that is damaged or cut off
     is simulated again. In Python, without a folder, the rollouts are returned.
 
@@ -77,6 +82,11 @@ def simulate(
             are used.
         num_rollouts: Number N of rollouts of each scenario.
         seed: Seed of the rollouts. The same seed gives the same rollouts.
+        seconds: Length of the rollouts. Scores, goals and submissions need the 8 of the metric; a longer rollout
+            begins with the same states as one of 8 s.
+        entries: Who enters where lanes cross the border of a region around the ego: "none", "fixed-rate", a file that
+            `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents beyond the border leave. Left out,
+            the agents of "now" are there all the time.
         goals: Goals file (docs/goals.md). Without --scenario only its scenarios are simulated. In Python, for rollouts
             in memory, points in meters in the world frame, {object_id: (x, y)} or {scenario_id: {object_id: (x, y)}},
             or goals of the whole batch as tensors.
@@ -103,12 +113,14 @@ def simulate(
         the files.
 
     Raises:
-        ConfigError: No scenario, fewer than one rollout, goals for a policy that is not goal-conditioned, for
-            scenarios that were not handed over or in another frame, or a folder of other rollouts.
+        ConfigError: No scenario, fewer than one rollout, a length that the model's decisions do not divide, goals for a
+            policy that is not goal-conditioned or for another length than 8 s, for scenarios that were not handed over
+            or in another frame, or a folder of other rollouts.
         DataError: An unknown scenario, or a goal of an agent that is not simulated, out of its reach, or not two finite
             numbers.
     """
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed, 0)
+    num_steps, entry_model = count_steps(seconds), None if entries is None else load_entries(entries)
     limit = None if limit is None else whole_number("limit", limit, 1)
     sampling = to_sampling(sampling)
     if out is None:
@@ -123,7 +135,9 @@ def simulate(
     model = with_guidance(frozen_copy(loaded) if is_training(loaded) else loaded, guidance_scale)
     if out is None:
         named = to_scenarios(scenarios, split) if isinstance(scenarios, str | PathLike) else scenarios
-        return simulate_in_memory(model, to_batch(named, get_device(model)), num_rollouts, seed, sampling, goals)
+        return simulate_in_memory(
+            model, to_batch(named, get_device(model)), num_rollouts, seed, num_steps, sampling, goals, entry_model
+        )
     check_jobs(jobs, get_device(model), "jobs")
     if not isinstance(scenarios, str | PathLike | ScenarioDataset) or not isinstance(goals, str | PathLike | None):
         raise ConfigError("rollouts in a folder need a data set, and goals in a file: give these, or no folder.")
@@ -134,7 +148,7 @@ def simulate(
     ids = list(dict.fromkeys(scenario or file.scenario_ids or dataset.scenario_ids))[:limit]
     check_scenarios(ids, file, dataset, str(dataset.folder if scenarios is dataset else scenarios), bool(scenario))
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(ids))
-    simulation = Simulation(model, dataset, tuple(ids), num_rollouts, seed, sampling, file, name)
+    simulation = Simulation(model, dataset, tuple(ids), num_rollouts, num_steps, seed, sampling, file, name, entries)
     paths = simulate_folder(simulation, Path(out), runner=runner)
     # also of rollouts that an earlier call has written
     report_rollouts(Path(out), dataset, ids, file, picture=picture, exporters=exporters)

@@ -1,7 +1,8 @@
 """Films of scenes: the panels of an animation side by side, step by step, in a file that plays anywhere."""
 
+import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,9 +48,14 @@ def to_film(
     # The last frame stays for a while, or the end could not be seen before a player starts again.
     camera, rate = Camera(animation, dots_per_inch), STEPS_PER_SECOND / steps_per_frame
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
-    frames = [camera.frame(animation.panels, step) for step in range(CURRENT_STEP, num_steps, steps_per_frame)]
-    frames += frames[-1:] * round(HOLD_AT_END_S * rate)
-    write_atomically(path, lambda temporary: write(temporary, frames, rate))
+    steps = range(CURRENT_STEP, num_steps, steps_per_frame)
+    held = itertools.repeat(steps[-1], round(HOLD_AT_END_S * rate))
+
+    def write_frames(temporary: Path) -> None:
+        # drawn as they are written: all frames of a minute would take a gigabyte
+        write(temporary, (camera.frame(animation.panels, step) for step in itertools.chain(steps, held)), rate)
+
+    write_atomically(path, write_frames)
 
 
 class Camera:
@@ -95,25 +101,27 @@ class Camera:
         return pixels[: len(pixels) // 2 * 2, : pixels.shape[1] // 2 * 2].copy()
 
 
-def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> None:
-    height, width, _ = frames[0].shape
+def _write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> None:
+    frames = iter(frames)
+    first = next(frames)
+    height, width, _ = first.shape
     writer = imageio_ffmpeg.write_frames(
         str(path), (width, height), fps=round(frames_per_second), codec="libx264", quality=5, macro_block_size=2,
         output_params=["-f", "mp4", "-movflags", "+faststart"], ffmpeg_log_level="error",
     )  # fmt: skip
     writer.send(None)  # starts the generator
-    for frame in frames:
+    for frame in itertools.chain([first], frames):
         writer.send(np.ascontiguousarray(frame))
     writer.close()
 
 
-def _write_pictures(path: Path, frames: list[Frame], frames_per_second: float, **options: Any) -> None:
+def _write_pictures(path: Path, frames: Iterable[Frame], frames_per_second: float, **options: Any) -> None:
     first, *later = (Image.fromarray(frame) for frame in frames)
     duration = round(1000 / frames_per_second)
     first.save(path, save_all=True, append_images=later, duration=duration, loop=0, **options)
 
 
-WRITERS: dict[str, Callable[[Path, list[Frame], float], None]] = {
+WRITERS: dict[str, Callable[[Path, Iterable[Frame], float], None]] = {
     ".mp4": _write_mp4,
     ".webp": partial(_write_pictures, format="WEBP", quality=60, method=4),
     ".gif": partial(_write_pictures, format="GIF"),

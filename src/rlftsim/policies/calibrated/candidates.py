@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from rlftsim.geometry import heading_vector, rotate, wrap_angle
+from rlftsim.rollout.types import FARTHEST_STEP_M
 from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
 from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, Scenario, cached_on_scenario
@@ -149,7 +150,11 @@ class Traffic:
             seconds: Duration of the decision, over which velocities are means.
         """
         position, heading = poses[..., -1:, :2], poses[..., -1:, 2]
-        velocity = (position - self.position) / seconds
+        before = self.position
+        if poses.shape[3] > 1:  # somebody who is put elsewhere has moved within the decision alone
+            is_elsewhere = (poses[..., :1, :2] - before).norm(dim=-1, keepdim=True) > FARTHEST_STEP_M
+            before = torch.where(is_elsewhere, 2 * poses[..., :1, :2] - poses[..., 1:2, :2], before)
+        velocity = (position - before) / seconds
         speed = (velocity * heading_vector(self.heading)).sum(-1)
         return Traffic(position, heading, velocity, speed, wrap_angle(heading - self.heading))
 

@@ -21,7 +21,7 @@ from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, EncodedGoals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import Past, Scene, View, mask_positions
-from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions
+from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere
 from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -124,7 +124,8 @@ class SmartPolicy(SmartModel):
 
     def encode(self, scenarios: ScenarioBatch) -> Context:
         """Map features, history tokens and decoder features, for goal-free agents."""
-        tokens = restart_at_log(self._tokenize(scenarios), scenarios, self.vocabulary)
+        past = scenarios.history()  # a minute of future would have to be tokenized
+        tokens = restart_at_log(self._tokenize(past), past, self.vocabulary)
         scene = self._build_scene(scenarios)
         history = self._logged_steps(tokens, slice(HISTORY_TOKENS))
         view = self.network.decoder.look(scene, history, None)
@@ -189,15 +190,17 @@ class SmartPolicy(SmartModel):
             decision: Id of the token that each agent takes, within the agent's class.
             forced: States [B, N, A, 5] imposed from outside; only agents with five valid states are imposed.
         """
+        start, is_elsewhere = (state.position, state.heading), None
+        if forced is not None:
+            start, is_elsewhere = begin_elsewhere(start, forced)
         poses, decision = apply_decisions(
-            decision, state.position, state.heading, context.object_type, self.vocabulary, forced,
-            catk_compat=self.config.catk_compat,
-        )  # fmt: skip
+            decision, *start, context.object_type, self.vocabulary, forced, catk_compat=self.config.catk_compat
+        )
         position, heading = poses[..., -1, :2], poses[..., -1, 2]
         block = TokenSteps(
             position=position[..., None, :],
             heading=heading[..., None],
-            motion=(position - state.position)[..., None, :],
+            motion=(position - start[0])[..., None, :],
             token_id=decision[..., None],
             valid=context.agent_mask[:, None, :, None].expand(*heading.shape, 1),
         )
@@ -207,6 +210,8 @@ class SmartPolicy(SmartModel):
             past = state.cache.past
         elif state.pending is not None:
             pending = state.pending.append(block)
+        if is_elsewhere is not None:
+            past = replace(past, row=torch.where(is_elsewhere[..., None], -1, past.row))
         num_decisions = state.num_decisions + 1
         return State(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
@@ -326,7 +331,8 @@ class SmartPolicy(SmartModel):
             if state.pending is None:
                 cache.features, cache.past = context.features[:, None].expand(*state.heading.shape, -1), past
             else:
-                past = past.last(self.config.history_tokens) if context.is_padded else past
+                if context.is_padded or past.row.shape[-1] >= 2 * self.config.history_tokens:
+                    past = past.last(self.config.history_tokens)  # no row looks farther back
                 view = decoder.look(context.scene, state.pending, past, padded=context.is_padded)
                 maps = None if torch.is_grad_enabled() else context.maps
                 rows, cache.past = decoder(context.scene, state.pending, past, view, state.goals, maps)

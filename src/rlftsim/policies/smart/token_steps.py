@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
-from rlftsim.rollout.types import AgentStates
+from rlftsim.rollout.types import FARTHEST_STEP_M, AgentStates
 from rlftsim.tokens import catk_compat as catk_ops
 from rlftsim.tokens.agent_tokens import AgentTokens, class_boxes, nearest_tokens
 from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
@@ -59,6 +59,23 @@ def build_logged_steps(tokens: AgentTokens, steps: slice, *, catk_compat: bool) 
         motion = torch.where(was_valid[..., None], motion, 0.0)
     fields = (position, tokens.heading, motion, tokens.token_id, tokens.valid)
     return TokenSteps(*(v[:, None, :, steps] for v in fields))
+
+
+def begin_elsewhere(
+    pose: tuple[Float[Tensor, "B N A 2"], Float[Tensor, "B N A"]], forced: AgentStates
+) -> tuple[tuple[Float[Tensor, "B N A 2"], Float[Tensor, "B N A"]], Bool[Tensor, "B N A"]]:
+    """Poses that a decision starts from, and True for agents that are put farther away than anybody drives.
+
+    Such an agent is somebody else: the pose is that of 0.1 s before the first imposed state.
+
+    Args:
+        pose: Positions and headings before the decision.
+        forced: States [B, N, A, 5] imposed from outside.
+    """
+    first, second = forced.position[..., 0, :], forced.position[..., 1, :]
+    is_elsewhere = forced.valid.all(-1) & ((first - pose[0]).norm(dim=-1) > FARTHEST_STEP_M)
+    start = torch.where(is_elsewhere[..., None], 2 * first - second, pose[0])
+    return (start, torch.where(is_elsewhere, forced.heading[..., 0], pose[1])), is_elsewhere
 
 
 def apply_decisions(

@@ -328,7 +328,9 @@ class TrafficBotsPolicy(nn.Module):
         mean, scene = state.memo.mean, context.scene
         if mean is None:
             windows, active = state.traffic.windows.add_decision_axis(), state.traffic.active[:, None]
-            agent_context = context.agent_context.select_steps(slice(state.num_decisions, state.num_decisions + 1))
+            # later than 8 s lights stay as they are then
+            step = min(state.num_decisions, FUTURE_STEPS - 1)
+            agent_context = context.agent_context.select_steps(slice(step, step + 1))
             features = self.network.features(windows, agent_context, state.conditioning, active)
             state.memo.mean = mean = self.network.mean_actions(features, scene)[:, 0]
             if context.record is not None:

@@ -32,14 +32,18 @@ from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_windows
 from rlftsim.scenario.synthetic.world import simulate_world
 from rlftsim.scenario.synthetic.worlds import WORLDS, write_world
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import STEP_S, TOTAL_STEPS, Scenario
 
 GENERATOR_VERSION = 1
 LICENSE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
 NETWORK_TYPES = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
 """Types of the networks in turn; a freeway gives half as many scenarios as the others."""
+FREEWAY_STEPS = 200
+"""Longest window of a freeway: later all of its cars have left it."""
 DEFAULT_SPLITS = {"training": 0.8, "validation": 0.2}
 MAX_ATTEMPTS = 6
+MAX_STEPS = 1200
+"""Longest scenario: two fit one after the other into the traffic that SUMO simulates."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,15 @@ class SyntheticRequest:
     scenarios_per_network: int = 10
     splits: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_SPLITS))
     """Fraction of the scenarios by split."""
+    num_steps: int = TOTAL_STEPS
+    """Length of each scenario in steps of 0.1 s."""
 
     def __post_init__(self) -> None:
+        if not TOTAL_STEPS <= self.num_steps <= MAX_STEPS:
+            raise ConfigError(
+                f"synthetic scenarios last {TOTAL_STEPS * STEP_S:g} to {MAX_STEPS * STEP_S:g} s, got "
+                f"{self.num_steps * STEP_S:g}"
+            )
         if self.num_scenarios < 1 or self.scenarios_per_network < 1:
             raise ConfigError(
                 f"num_scenarios = {self.num_scenarios} and scenarios_per_network = {self.scenarios_per_network} "
@@ -71,6 +82,8 @@ class NetworkTask:
     network_type: str
     num_scenarios: int
     seed: tuple[int, ...]
+    num_steps: int = TOTAL_STEPS
+    """Length of each scenario."""
     worlds: Path | None = None
     """Folder of the worlds that SUMO can run again; None = they are not kept."""
 
@@ -92,11 +105,14 @@ def plan_networks(request: SyntheticRequest, worlds: Path | None = None) -> list
         total = round(request.num_scenarios * fraction)
         count = max(1, round(total / request.scenarios_per_network))
         types = [NETWORK_TYPES[k % len(NETWORK_TYPES)] for k in range(count)]
+        if request.num_steps > FREEWAY_STEPS:
+            types = [name.replace("freeway", "city") for name in types]
         weights = np.array([0.5 if network_type == "freeway" else 1.0 for network_type in types])
         # cumulated and rounded, so that the numbers add up to the total
         counts = np.diff(np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)).tolist()
         for k, (network_type, num_scenarios) in enumerate(zip(types, counts)):
-            tasks.append(NetworkTask(split, k, network_type, num_scenarios, (request.seed, split_number, k), worlds))
+            seed = (request.seed, split_number, k)
+            tasks.append(NetworkTask(split, k, network_type, num_scenarios, seed, request.num_steps, worlds))
     return tasks
 
 
@@ -113,7 +129,7 @@ def generate_scenarios(task: NetworkTask) -> Iterator[Scenario]:
         with tempfile.TemporaryDirectory(prefix="rlftsim_synthetic_") as name:
             world = simulate_world(task.network_type, seed, Path(name), keeps_source=task.worlds is not None)
         windows = []
-        for window in islice(cut_windows(world, np.random.default_rng((*seed, 1))), missing):
+        for window in islice(cut_windows(world, np.random.default_rng((*seed, 1)), task.num_steps), missing):
             missing -= 1
             windows.append(window)
             yield window.scenario
@@ -131,6 +147,7 @@ def generate(
     *,
     num_scenarios: int,
     seed: int,
+    num_steps: int = TOTAL_STEPS,
     jobs: int = 1,
     runner: Runner | None = None,
     splits: Mapping[str, float] | None = None,
@@ -146,6 +163,7 @@ def generate(
         destination: Folder of the data set; new, empty, or left unfinished by the same call.
         num_scenarios: Number of scenarios in all splits together.
         seed: Seed of all networks and of the traffic on them.
+        num_steps: Length of each scenario in steps of 0.1 s, from 91 on; the step 10 is "now" in all of them.
         jobs: Number of networks made at the same time; does not change the result.
         runner: Runner of the work in place of such processes, see `rlftsim.jobs.runner`.
         splits: Fraction of the scenarios by split, which share no network; None = 80 % training, 20 % validation.
@@ -163,7 +181,7 @@ def generate(
         Unfinished: `runner` is a share, which is done, while others are not.
     """
     splits = dict(DEFAULT_SPLITS if splits is None else splits)
-    request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
+    request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits, num_steps)
     folder = Path(destination)
     check_folder(folder, "data set")
     tasks = plan_networks(request, folder / WORLDS if keep_worlds else None)

@@ -1,4 +1,4 @@
-"""Scenarios of 9.1 seconds cut from minutes of traffic: choice of the ego, of visible agents, of tracks to predict.
+"""Scenarios of 9.1 s or longer cut from minutes of traffic: choice of ego, visible agents, tracks to predict.
 
 A window becomes a scenario only if bodies accelerate and turn plausibly, keep apart, and stay on the road.
 """
@@ -110,10 +110,13 @@ def compute_off_road_m(
 
 FIRST_START = 20
 """Smoothing over time bends the very first steps of a recording."""
-WINDOW_EVERY_STEPS = 100
+GAP_STEPS = 9
+"""Steps between windows that follow one another."""
 EGO_TO_END_M = 95.0
 EGO_TO_EGO_M = 70.0
 MAP_BEYOND_RANGE_M = 20.0
+ROAMING_MPS = 10.0
+"""Map and lights of a window longer than 9.1 s reach so much farther per second: an ego may drive elsewhere."""
 PREDICT_WITHIN_M = 70.0
 MAX_PREDICTED_PEDESTRIANS = 2
 POSITION_GRID_PER_M = 512
@@ -170,13 +173,13 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Bodies seen in a window; arrays over the 91 steps, zero where a body does not exist."""
+    """Bodies seen in a window; arrays over its S steps, zero where a body does not exist."""
 
     bodies: list[Body]
-    position: Float[np.ndarray, "o 91 2"]
-    heading: Float[np.ndarray, "o 91"]
-    velocity: Float[np.ndarray, "o 91 2"]
-    valid: Bool[np.ndarray, "o 91"]
+    position: Float[np.ndarray, "o S 2"]
+    heading: Float[np.ndarray, "o S"]
+    velocity: Float[np.ndarray, "o S 2"]
+    valid: Bool[np.ndarray, "o S"]
 
     @property
     def traveled_m(self) -> Float[np.ndarray, "o"]:
@@ -185,15 +188,15 @@ class _View:
         return (np.linalg.norm(np.diff(self.position, axis=1), axis=-1) * is_valid).sum(axis=1)
 
 
-def _look(bodies: list[Body], start: int, ego: Body, range_m: float, rng: np.random.Generator) -> _View:
+def _look(bodies: list[Body], start: int, num_steps: int, ego: Body, range_m: float, rng: np.random.Generator) -> _View:
     """All bodies the ego sees at any step of the window; the ego comes last."""
-    ego_slice = slice(start - ego.first_step, start - ego.first_step + TOTAL_STEPS)
-    ego_path = ego.position[ego_slice]  # [91, 2]
+    ego_slice = slice(start - ego.first_step, start - ego.first_step + num_steps)
+    ego_path = ego.position[ego_slice]  # [S, 2]
     visible_bodies, arrays = [], []
     for body in [*(candidate for candidate in bodies if candidate is not ego), ego]:
         # 1. Steps [first, last) of the window in which the body exists, and the same steps of the body's own life.
         first = max(0, body.first_step - start)
-        last = min(TOTAL_STEPS, body.first_step + body.num_steps - start)
+        last = min(num_steps, body.first_step + body.num_steps - start)
         if last <= first:
             continue
         index = start + first - body.first_step
@@ -203,19 +206,19 @@ def _look(bodies: list[Body], start: int, ego: Body, range_m: float, rng: np.ran
         distance = np.linalg.norm(body.position[span] - ego_path[first:last], axis=1)
         if distance.min() > range_m:
             continue
-        is_visible = np.ones(TOTAL_STEPS, bool)
+        is_visible = np.ones(num_steps, bool)
         if body is not ego:
             is_visible = distance < range_m
             # now and then a spell behind something, the more likely the farther away
             if rng.random() < 0.5 * np.clip(distance.mean() / range_m, 0.0, 1.0):
-                begin = int(rng.integers(-20, TOTAL_STEPS))
+                begin = int(rng.integers(-20, num_steps))
                 is_visible[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
         if not is_visible.any():
             continue
 
         # 3. Its states, where it exists; `valid` where it is seen.
-        position, heading = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS)
-        velocity, valid = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS, bool)
+        position, heading = np.zeros((num_steps, 2)), np.zeros(num_steps)
+        velocity, valid = np.zeros((num_steps, 2)), np.zeros(num_steps, bool)
         position[first:last], heading[first:last] = body.position[span], body.heading[span]
         velocity[first:last], valid[first:last] = body.velocity[span], is_visible
         visible_bodies.append(body)
@@ -259,8 +262,8 @@ def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: An
         rng: Generator of all choices; the order of bodies decides the draws.
         drivable: Drivable area of the network as a shapely geometry.
     """
-    # 1. Candidates: seen now and mostly later, near the ego.
-    future = slice(CURRENT_STEP + 1, None)
+    # 1. Candidates: seen now and mostly in the 8 s of the metric, near the ego.
+    future = slice(CURRENT_STEP + 1, TOTAL_STEPS)
     ego_position = view.position[-1, CURRENT_STEP]
     candidates = [
         k
@@ -310,7 +313,7 @@ def _observe_lights(
             lights.append((junction, link, lane_id, stop_point, arrow))
     # 2. Their states, step by step.
     rows = []
-    for step in range(TOTAL_STEPS):
+    for step in range(len(ego_path)):
         for junction, link, lane_id, stop, arrow in lights:
             letter = world.signals[junction][start + step][link]
             rows.append((step, lane_id, _LIGHT_STATES.get(letter, _STOP)[arrow], *stop))
@@ -345,7 +348,7 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
     )
 
 
-def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Body]:
+def _choose_egos(world: World, start: int, num_steps: int, rng: np.random.Generator) -> list[Body]:
     """At most two egos of a window, far apart, so that the scenarios share little."""
     # 1. Cars that exist throughout the window and keep away from the network's ends; moving ones are preferred.
     candidates, weights = [], []
@@ -353,9 +356,9 @@ def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Bod
         index = start - body.first_step
         if body.object_type != ObjectType.VEHICLE or not body.is_evaluable or body.is_parked:
             continue
-        if index < 0 or index + TOTAL_STEPS > body.num_steps:
+        if index < 0 or index + num_steps > body.num_steps:
             continue
-        path = body.position[index : index + TOTAL_STEPS]
+        path = body.position[index : index + num_steps]
         if np.linalg.norm(path[::10, None] - world.ends[None], axis=-1).min() > EGO_TO_END_M:
             candidates.append(body)
             weights.append(6.0 if np.linalg.norm(path[-1] - path[0]) > 1.0 else 1.0)
@@ -375,17 +378,18 @@ def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Bod
     return [first]
 
 
-def cut_window(world: World, start: int, ego: Body, rng: np.random.Generator) -> Window | None:
+def cut_window(world: World, start: int, num_steps: int, ego: Body, rng: np.random.Generator) -> Window | None:
     """Scenario of a window from the ego's view; None if the window fails a gate.
 
     Args:
         world: Simulated network with bodies, lights and map.
         start: Step of the recording at which the window begins.
+        num_steps: Length of the window in steps of 0.1 s, at least 91.
         ego: Body that exists throughout the window.
         rng: Generator of all choices; equal states give equal scenarios.
     """
     range_m = float(rng.uniform(65.0, 95.0))
-    view = _look(list(world.bodies), start, ego, range_m, rng)
+    view = _look(list(world.bodies), start, num_steps, ego, range_m, rng)
     drivable = world.cropper.network_map.drivable
     if not _passes_gates(view, rng) or not _is_on_road(view, len(view.bodies) - 1, drivable):
         return None
@@ -394,15 +398,16 @@ def cut_window(world: World, start: int, ego: Body, rng: np.random.Generator) ->
         return None
     # the map reaches beyond the range of vision, so that agents at its rim stand on lanes
     ego_path = view.position[-1]
-    features = world.cropper.crop(ego_path[::6], range_m + MAP_BEYOND_RANGE_M)
+    reach_m = range_m + ROAMING_MPS * STEP_S * (num_steps - TOTAL_STEPS)
+    features = world.cropper.crop(ego_path[::6], reach_m + MAP_BEYOND_RANGE_M)
     # an id that is stable, and unlike those of other worlds
     name = f"{world.name}/{start}/{world.bodies.index(ego)}"
     scenario = Scenario(
         scenario_id=hashlib.sha256(name.encode()).hexdigest()[:16],
-        timestamps_s=np.round(np.arange(TOTAL_STEPS) * STEP_S, 1),
+        timestamps_s=np.round(np.arange(num_steps) * STEP_S, 1),
         tracks=_label(view, world, rng),
         map_features=features,
-        lights=_observe_lights(world, features, start, ego_path, range_m),
+        lights=_observe_lights(world, features, start, ego_path, reach_m),
         ego_index=len(view.bodies) - 1,
         tracks_to_predict=np.array(predicted, np.int32),
         difficulty=np.ones(len(predicted), np.int8),
@@ -412,7 +417,7 @@ def cut_window(world: World, start: int, ego: Body, rng: np.random.Generator) ->
     return Window(scenario, start, view.bodies)
 
 
-def cut_windows(world: World, rng: np.random.Generator) -> Iterator[Window]:
+def cut_windows(world: World, rng: np.random.Generator, num_steps: int = TOTAL_STEPS) -> Iterator[Window]:
     """Windows of a world in random order, without windows that fail a gate.
 
     No two scenarios overlap in time and position.
@@ -420,10 +425,12 @@ def cut_windows(world: World, rng: np.random.Generator) -> Iterator[Window]:
     Args:
         world: Simulated network with bodies, lights and map.
         rng: Generator of all choices; equal states give equal scenarios.
+        num_steps: Length of a window in steps of 0.1 s, at least 91.
     """
-    starts = rng.permutation(np.arange(FIRST_START, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
+    every = num_steps + GAP_STEPS
+    starts = rng.permutation(np.arange(FIRST_START, world.num_steps - num_steps, every))
     for start in starts.tolist():
-        for ego in _choose_egos(world, start, rng):
-            window = cut_window(world, start, ego, rng)
+        for ego in _choose_egos(world, start, num_steps, rng):
+            window = cut_window(world, start, num_steps, ego, rng)
             if window is not None:
                 yield window

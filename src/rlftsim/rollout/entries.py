@@ -1,0 +1,267 @@
+"""Models of who enters the region around the ego, where lanes cross its border; names in `ENTRIES`.
+
+A package of your own adds one:
+
+[project.entry-points."rlftsim.entries"]
+busy = "my_package:BusyEntries"
+
+G gates, K entrants of logs.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.geometry import wrapped
+from rlftsim.jobs.arrays import read_npz
+from rlftsim.jobs.files import write_atomically
+from rlftsim.plugins import ExtensionPoint
+from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, Gates, find_region_m
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
+
+REACH_M = 15.0
+"""Largest distance of an entrant from the gate that it counts for."""
+FIXED_PER_S = 0.03
+"""Entries per second of a gate where traffic drives in, of `fixed-rate`: about 100 vehicles per hour and lane."""
+LEAST_MPS = 0.3
+LANE_HALF_WIDTH_M, MOST_TURN_RAD = 1.5, 0.4
+NEWTON_STEPS, RIDGE = 30, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Entrants:
+    """Who enters, relative to the lane of a gate."""
+
+    object_type: Int64[np.ndarray, "K"]
+    left_m: Float[np.ndarray, "K"]
+    """Distance from the lane's center to the left."""
+    turn_rad: Float[np.ndarray, "K"]
+    """Heading minus direction of the lane."""
+    speed_mps: Float[np.ndarray, "K"]
+
+    def select(self, index: Int64[np.ndarray, "n"]) -> "Entrants":
+        """Some of the entrants."""
+        return Entrants(*(values[index] for values in vars(self).values()))
+
+
+@runtime_checkable
+class EntryModel(Protocol):
+    """Decides at each gate and half second whether somebody enters, and who."""
+
+    def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
+        """Expected number of entries in half a second at each gate.
+
+        Args:
+            gates: Places where lanes cross the border of the region, with the speeds at which these come nearer.
+        """
+        ...
+
+    def draw(self, gates: Gates, rng: np.random.Generator) -> Entrants:
+        """An entrant for each gate.
+
+        Args:
+            gates: Gates at which somebody enters.
+            rng: Generator of all choices.
+        """
+        ...
+
+
+class NoEntries:
+    """Nobody enters: agents leave alone."""
+
+    def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
+        """Zeros."""
+        return np.zeros(len(gates))
+
+    def draw(self, gates: Gates, rng: np.random.Generator) -> Entrants:
+        """Vehicles in the middle of the lane at its speed.
+
+        Args:
+            gates: Gates at which somebody enters.
+            rng: Generator of all choices, not used.
+        """
+        zeros = np.zeros(len(gates))
+        return Entrants(np.ones(len(gates), np.int64), zeros, zeros, gates.lane_mps)
+
+
+class FixedRate(NoEntries):
+    """Vehicles enter at the same rate at every gate where traffic drives in."""
+
+    def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
+        """A constant where the lane leads in, else 0."""
+        return FIXED_PER_S * DECISION_STEPS * STEP_S * (gates.lane_closing_mps > LEAST_MPS)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedEntries:
+    """Poisson regression on the speeds at which a lane's traffic and standing agents come nearer; entrants of logs."""
+
+    weights: tuple[float, ...]
+    entrants: Entrants
+
+    def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
+        """Exponential of the linear predictor."""
+        return np.exp(np.minimum(_describe(gates) @ np.array(self.weights), 0.0))
+
+    def draw(self, gates: Gates, rng: np.random.Generator) -> Entrants:
+        """Entrants of the logs, each at a gate where it drives in, or stands and is reached by the ego.
+
+        Args:
+            gates: Gates at which somebody enters.
+            rng: Generator of all choices.
+        """
+        # speed [G, K] at which each entrant comes nearer at each gate: who enters does, the likelier the faster
+        direction, (x, y) = gates.heading[:, None] + self.entrants.turn_rad, gates.inward.T[..., None]
+        closing = self.entrants.speed_mps * (np.cos(direction) * x + np.sin(direction) * y)
+        level = np.maximum(closing + gates.standing_closing_mps[:, None], 1e-6).cumsum(1)
+        index = (level < rng.random((len(gates), 1)) * level[:, -1:]).sum(1)
+        return self.entrants.select(index)
+
+
+def _describe(gates: Gates) -> Float[np.ndarray, "G 3"]:
+    """Inputs of the regression: 1, and logarithms of both closing speeds."""
+    speeds = np.stack([gates.lane_closing_mps, gates.standing_closing_mps], -1)
+    return np.concatenate([np.ones((len(gates), 1)), np.log(LEAST_MPS + np.maximum(speeds, 0.0))], -1)
+
+
+def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
+    """Entry model of long logs, by Newton's method on the Poisson likelihood.
+
+    Args:
+        scenarios: Logs with lanes, longer than 9.1 s, in which agents become visible at the border of a region.
+
+    Raises:
+        DataError: Nobody enters in the logs.
+    """
+    inputs, counts, rows = [], [], []
+    for scenario in scenarios:
+        log, finder = _LoggedEntries(scenario), GateFinder(scenario)
+        for step in range(CURRENT_STEP, scenario.num_steps - DECISION_STEPS, DECISION_STEPS):
+            gates = finder.find(log.position[log.ego, step], log.velocity[log.ego, step], log.region_m)
+            if not len(gates):
+                continue
+            gate, entered = log.assign(gates, step)
+            inputs.append(_describe(gates))
+            counts.append(np.bincount(gate, minlength=len(gates)))
+            rows.append(log.describe(gates, gate, entered, step))
+    entrants = Entrants(*(np.concatenate(values) for values in zip(*(vars(row).values() for row in rows))))
+    if not len(entrants.speed_mps):
+        raise DataError("nobody enters in these logs: take longer ones, as rlftsim synthesize --seconds 70 makes.")
+    x, y = np.concatenate(inputs), np.concatenate(counts)
+    weights = np.array([np.log(y.mean()), 0.0, 0.0])
+    for _ in range(NEWTON_STEPS):
+        expected = np.exp(x @ weights)
+        curvature = (x * expected[:, None]).T @ x + RIDGE * np.eye(3)
+        weights = weights + np.linalg.solve(curvature, x.T @ (y - expected) - RIDGE * weights)
+    return FittedEntries(tuple(weights.tolist()), entrants)
+
+
+class _LoggedEntries:
+    """Motion of a log's agents in its map frame."""
+
+    def __init__(self, scenario: Scenario):
+        tracks, self.ego = scenario.tracks, scenario.ego_index
+        self.position = tracks.position[..., :2].astype(np.float64) - scenario.origin
+        self.velocity, self.heading, self.valid = tracks.velocity, tracks.heading, tracks.valid
+        self.object_type = tracks.object_type.astype(np.int64)
+        self.region_m = find_region_m(scenario)
+
+    @cached_property
+    def distance(self) -> Float[np.ndarray, "O S"]:
+        """Distance from the ego."""
+        return np.linalg.norm(self.position - self.position[self.ego], axis=-1)
+
+    def assign(self, gates: Gates, step: int) -> tuple[Int64[np.ndarray, "K"], Int64[np.ndarray, "K"]]:
+        """Gate and track of each agent that is seen half a second later and was beyond the border or not seen."""
+        later = step + DECISION_STEPS
+        enters = self.valid[:, later] & ~self.valid[:, step] & (self.distance[:, later] > self.region_m - REACH_M)
+        tracks = np.flatnonzero(enters)
+        gap = np.linalg.norm(self.position[tracks, None, later] - gates.position, axis=-1)
+        nearest = gap.argmin(1) if len(tracks) else np.zeros(0, np.int64)
+        is_near = gap[np.arange(len(tracks)), nearest] < REACH_M
+        return nearest[is_near], tracks[is_near]
+
+    def describe(self, gates: Gates, gate: np.ndarray, tracks: np.ndarray, step: int) -> Entrants:
+        """Entrants relative to their gates' lanes."""
+        later = step + DECISION_STEPS
+        offset = self.position[tracks, later] - gates.position[gate]
+        normal = np.stack([-np.sin(gates.heading[gate]), np.cos(gates.heading[gate])], -1)
+        speed = np.linalg.norm(self.velocity[tracks, later], axis=-1)
+        turn = wrapped(self.heading[tracks, later] - gates.heading[gate])
+        left = (offset * normal).sum(-1)
+        # a vehicle that drives along another lane than the nearest gate's tells nothing of that lane
+        is_along = (np.abs(left) < LANE_HALF_WIDTH_M) & (np.abs(turn) < MOST_TURN_RAD)
+        is_described = is_along | (speed < LEAST_MPS) | (self.object_type[tracks] != ObjectType.VEHICLE)
+        entrants = Entrants(self.object_type[tracks], left, turn.astype(float), speed.astype(float))
+        return entrants.select(np.flatnonzero(is_described))
+
+
+NO_ENTRIES, FIXED_RATE = NoEntries(), FixedRate()
+ENTRIES: ExtensionPoint[EntryModel] = ExtensionPoint(
+    "entry model",
+    "rlftsim.entries",
+    {"none": "rlftsim.rollout.entries:NO_ENTRIES", "fixed-rate": "rlftsim.rollout.entries:FIXED_RATE"},
+    use=lambda name: load_entries(name),
+)
+"""Name -> entry model."""
+
+
+def load_entries(name: str) -> EntryModel:
+    """The entry model of a name or of a file.
+
+    Args:
+        name: Registered name such as "fixed-rate", or a file that `rlftsim entries fit` wrote, FILE.npz.
+
+    Raises:
+        ConfigError: An unknown name, with the nearest known one, or an object that is no entry model.
+        DataError: A missing or damaged file.
+    """
+    if name.endswith(".npz"):
+        return _read_entries(name)
+    model = ENTRIES.get(name)
+    if not isinstance(model, EntryModel):
+        raise ConfigError(f"entry model {name!r} is of type {type(model).__name__}: give it expect and draw.")
+    return model
+
+
+def identify_entries(name: str) -> str:
+    """Text that is equal for the same entry model: the name, or a hash of the file."""
+    return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16] if name.endswith(".npz") else name
+
+
+def write_entries(path: Path, model: FittedEntries) -> None:
+    """Write a fitted model to FILE.npz, whole or not at all.
+
+    Args:
+        path: File that `load_entries` reads.
+        model: Weights of the regression, and the entrants of the logs.
+    """
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, weights=np.array(model.weights), **vars(model.entrants))
+
+    write_atomically(path, write)
+
+
+def _read_entries(path: str) -> FittedEntries:
+    names, remedy = ("weights", *(column.name for column in fields(Entrants))), "fit it again with rlftsim entries fit"
+    try:
+        arrays = read_npz(path, names, remedy)
+    except FileNotFoundError:
+        raise DataError(f"{path}: there is no such file of entries: {remedy}.") from None
+    columns = [arrays.get(name) for name in names]
+    lengths = {column.shape for column in columns[1:] if column is not None}
+    are_numbers = all(c is not None and c.ndim == 1 and c.dtype.kind in "if" and np.isfinite(c).all() for c in columns)
+    if not are_numbers or len(lengths) != 1 or lengths == {(0,)} or arrays["weights"].shape != (3,):
+        raise DataError(f"{path}: no {', '.join(names)} as finite numbers of equal length in it: {remedy}.")
+    # the values of a file may be anything: rates stay below one entry per gate and half second, speeds below 180 km/h
+    weights, *entrants = (column.clip(-50, 50) for column in columns if column is not None)
+    return FittedEntries(tuple(weights.astype(float).tolist()), Entrants(entrants[0].astype(np.int64), *entrants[1:]))

@@ -1,0 +1,93 @@
+"""The region around the ego, and the gates where lanes cross its border. Map frame, meters.
+
+G gates, P points of lanes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.scenario.lane_graph import lane_graph
+from rlftsim.scenario.polylines import arc_length, resample_to
+from rlftsim.scenario.types import CURRENT_STEP, Scenario
+
+DECISION_STEPS = 5
+"""Agents enter and leave every half second."""
+SPACING_M = 2.0
+NARROWEST_M, WIDEST_M = 60.0, 120.0
+UNKNOWN_LIMIT_MPS, CRUISE = 10.0, 0.7
+"""Speed limit where none is known, and the fraction of the limit that traffic drives."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gates:
+    """Places where lanes cross the border of the region."""
+
+    position: Float[np.ndarray, "G 2"]
+    heading: Float[np.ndarray, "G"]
+    """Direction of the lane."""
+    inward: Float[np.ndarray, "G 2"]
+    """Unit vector towards the ego."""
+    lane_mps: Float[np.ndarray, "G"]
+    """Usual speed on the lane."""
+    lane_closing_mps: Float[np.ndarray, "G"]
+    """Speed at which traffic on the lane comes nearer to the ego; negative = goes away."""
+    standing_closing_mps: Float[np.ndarray, "G"]
+    """Speed at which what stands there comes nearer."""
+
+    def __len__(self) -> int:
+        return len(self.heading)
+
+    def select(self, index: np.ndarray) -> "Gates":
+        """Some of the gates."""
+        return Gates(*(values[index] for values in vars(self).values()))
+
+
+class GateFinder:
+    """Finds the gates of a scenario's map.
+
+    Args:
+        scenario: Scenario with the map; without lanes there are no gates.
+    """
+
+    def __init__(self, scenario: Scenario):
+        graph = lane_graph(scenario)
+        points, headings, speeds, follows = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, bool)]
+        for line, limit in zip(graph.lines, graph.speed_limit_mps):
+            count = max(int(np.ceil(arc_length(line)[-1] / SPACING_M)), 1) + 1
+            sampled = resample_to(line[:, :2] - scenario.origin, count)
+            direction = np.diff(sampled, axis=0, append=2 * sampled[-1:] - sampled[-2:-1])
+            points.append(sampled)
+            headings.append(np.arctan2(direction[:, 1], direction[:, 0]))
+            speeds.append(np.full(count, CRUISE * (limit or UNKNOWN_LIMIT_MPS)))
+            follows.append(np.arange(count) < count - 1)
+        self.points, self.heading = np.concatenate(points), np.concatenate(headings)
+        self.speed, self.is_followed = np.concatenate(speeds), np.concatenate(follows)
+        ends = [line[-1, :2] - scenario.origin for line, next in zip(graph.lines, graph.successors) if not next]
+        self.ends = np.array(ends).reshape(-1, 2)
+
+    def find(self, ego: Float[np.ndarray, "2"], ego_velocity: Float[np.ndarray, "2"], region_m: float) -> Gates:
+        """Gates of a region.
+
+        Args:
+            ego: Position of the ego, the center of the region.
+            ego_velocity: Velocity of the ego, m/s.
+            region_m: Radius of the region.
+        """
+        offset = self.points - ego
+        is_inside = (offset * offset).sum(-1) < region_m**2
+        index = np.flatnonzero(self.is_followed[:-1] & (is_inside[1:] != is_inside[:-1]))
+        inward = -offset[index] / np.linalg.norm(offset[index], axis=-1, keepdims=True)
+        heading, speed = self.heading[index], self.speed[index]
+        velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+        standing = -(ego_velocity * inward).sum(-1)
+        return Gates(self.points[index], heading, inward, speed, (velocity * inward).sum(-1) + standing, standing)
+
+
+def find_region_m(scenario: Scenario) -> float:
+    """Radius of the region in which agents are seen: up to the farthest one within 120 m now, 60 m at least."""
+    tracks = scenario.tracks
+    now = tracks.position[tracks.valid[:, CURRENT_STEP], CURRENT_STEP, :2]
+    distance = np.linalg.norm(now - tracks.position[scenario.ego_index, CURRENT_STEP, :2], axis=-1)
+    return float(distance[distance < WIDEST_M].max(initial=NARROWEST_M))

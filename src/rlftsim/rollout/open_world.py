@@ -1,0 +1,213 @@
+"""Worlds that agents leave and enter: whoever is too far from the ego goes, and the row is taken by somebody new.
+
+An agent that is absent waits far outside of the map, where no agent sees it. Policies know nothing of this: an agent is
+put elsewhere by imposed states, as `rollout.simulate` lets any caller do, and begins there without a past.
+
+N rollouts, A agents, visitors included. Map frame, meters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rlftsim.errors import ConfigError
+from rlftsim.rollout.entries import EntryModel
+from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, find_region_m
+from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.types import AgentStates
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario, Tracks
+
+WAITING_M, WAITING_GAP_M = 20_000.0, 60.0
+"""Distance of absent agents from the origin, and from one another."""
+VISITORS = {ObjectType.VEHICLE: 40, ObjectType.PEDESTRIAN: 10, ObjectType.CYCLIST: 6}
+"""Rows that wait for somebody to enter, beside those of agents that have left."""
+VISITOR_SIZE_M = {
+    ObjectType.VEHICLE: (4.6, 2.0, 1.6), ObjectType.PEDESTRIAN: (0.9, 0.85, 1.7), ObjectType.CYCLIST: (1.85, 0.85, 1.8),
+}  # fmt: skip
+BEYOND_BORDER_M = 10.0
+"""An agent leaves so far outside of the region, so that nobody flickers at the border."""
+AT_END_M = 5.0
+"""An agent leaves so near to the end of a lane that goes on nowhere."""
+EGO_GAP_M = 40.0
+BRAKING_MPS2 = 3.0
+STANDSTILL_GAP_M, BESIDE_M, ANYWHERE_M = 6.0, 2.3, 3.0
+"""Least distance of centers along and across the way and in any direction; the first is left after braking, too."""
+PARKED_M, PARKED_MPS = 1.8, 0.3
+"""A vehicle that enters so far beside the lane's center and so slowly is parked, and stays."""
+LANE_HALF_WIDTH_M = 1.8
+LOOK_M = 80.0
+
+
+def add_visitors(scenario: Scenario) -> Scenario:
+    """The scenario with rows for agents that may enter, which wait outside of the map; a row has one type and size."""
+    tracks = scenario.tracks
+    types = np.repeat([int(kind) for kind in VISITORS], list(VISITORS.values())).astype(np.int8)
+    sizes = np.array([VISITOR_SIZE_M[ObjectType(int(kind))] for kind in types], np.float32)
+    shape = (len(types), scenario.num_steps)
+    position = np.zeros((*shape, 3), np.float32)
+    position[..., 0] = scenario.origin[0] + WAITING_M + WAITING_GAP_M * np.arange(len(types))[:, None]
+    position[..., 1] = scenario.origin[1] + WAITING_M
+    visitors = Tracks(
+        object_id=tracks.object_id.max() + 1 + np.arange(len(types)),
+        object_type=types,
+        position=position,
+        heading=np.zeros(shape, np.float32),
+        velocity=np.zeros((*shape, 2), np.float32),
+        size=np.repeat(sizes[:, None], shape[1], 1),
+        valid=np.ones(shape, bool),
+    )
+    names = vars(visitors)
+    joined = Tracks(**{name: np.concatenate([getattr(tracks, name), names[name]]) for name in names})
+    return replace(scenario, tracks=joined)
+
+
+class OpenWorld:
+    """Who is there in N rollouts of a scenario.
+
+    Args:
+        batch: A single scenario, with visitors (`add_visitors`).
+        rollout_ids: Ids of the rollouts, which with the seed decide who enters.
+        seed: Seed of the rollouts.
+        steps_per_decision: Steps of a decision of the policy, 5.
+        entries: Model of who enters.
+
+    Raises:
+        ConfigError: Several scenarios, or a policy that does not decide every half second.
+    """
+
+    def __init__(
+        self, batch: ScenarioBatch, rollout_ids: Sequence[int], seed: int, steps_per_decision: int, entries: EntryModel
+    ):
+        if steps_per_decision != DECISION_STEPS or batch.num_scenarios != 1:
+            raise ConfigError(
+                f"agents enter every {DECISION_STEPS} steps of one scenario, the policy decides every "
+                f"{steps_per_decision} of {batch.num_scenarios}: leave entries out."
+            )
+        (scenario,) = batch.scenarios
+        self.entries, self.finder, self.region_m = entries, GateFinder(scenario), find_region_m(scenario)
+        self.ego = int(np.flatnonzero(scenario.simulated_indices == scenario.ego_index)[0])
+        self.rngs = [
+            np.random.default_rng(derive_seed(seed, "entries", scenario.scenario_id, rollout))
+            for rollout in rollout_ids
+        ]
+        self.object_type = batch.object_type[0].cpu().numpy()
+        shape = (len(rollout_ids), len(self.object_type))
+        first_visitor = len(scenario.simulated_indices) - sum(VISITORS.values())  # padding comes behind the visitors
+        now = [batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]]
+        self._start = torch.cat(now, -1).expand(*shape, 3).double().cpu().numpy()  # [N, A, 3]
+        self._start_velocity = batch.velocity[0, :, CURRENT_STEP].expand(*shape, 2).double().cpu().numpy()
+        self.present: Bool[np.ndarray, "N A"] = np.broadcast_to(np.arange(shape[1]) < first_visitor, shape).copy()
+        self.is_parked: Bool[np.ndarray, "N A"] = np.zeros(shape, bool)
+        self.waiting = np.zeros((shape[1], 3))
+        self.waiting[:, 0] = WAITING_M + WAITING_GAP_M * (np.arange(shape[1]) - first_visitor)
+        self.waiting[:, 1] = WAITING_M
+        self._valid: list[Bool[np.ndarray, "N A"]] = []
+
+    @property
+    def valid(self) -> Bool[Tensor, "1 N A T"]:
+        """True = the agent is there at the simulated step."""
+        return torch.from_numpy(np.stack(self._valid, -1).repeat(DECISION_STEPS, -1))[None]
+
+    def force(self, state: Any, step: int) -> AgentStates:
+        """States of the next half second of agents that are absent or enter.
+
+        Args:
+            state: State of the policy before the decision.
+            step: First step of the decision.
+        """
+        pose, velocity = self._start, self._start_velocity
+        if state.poses is not None:
+            poses = state.poses[0].double().cpu().numpy()  # [N, A, 5, 3]
+            pose, velocity = poses[:, :, -1], (poses[:, :, -1, :2] - poses[:, :, -2, :2]) / STEP_S
+        forced = np.repeat(self.waiting[None, :, None], len(pose), 0).repeat(DECISION_STEPS, 2)  # [N, A, 5, 3]
+        is_free = ~self.present  # who leaves now is away for half a second at least
+        self._remove(pose)
+        self.is_parked &= self.present
+        imposed = ~self.present | self.is_parked
+        forced[self.is_parked] = pose[self.is_parked][:, None]
+        for n, rng in enumerate(self.rngs):
+            for agent, path, is_parked in self._enter(pose[n], velocity[n], self.present[n], is_free[n], rng):
+                forced[n, agent], imposed[n, agent] = path, True
+                self.present[n, agent], self.is_parked[n, agent] = True, is_parked
+        self._valid.append(self.present.copy())
+        poses, valid = torch.from_numpy(forced[None]).float(), torch.from_numpy(imposed)[None, :, :, None]
+        device = "cpu" if state.poses is None else state.poses.device
+        return AgentStates(
+            poses[..., :2].to(device), poses[..., 2].to(device), valid.expand(poses.shape[:-1]).to(device)
+        )
+
+    def _remove(self, pose: Float[np.ndarray, "N A 3"]) -> None:
+        """Agents that are beyond the border, or at the end of a lane that goes on nowhere, are absent from now on."""
+        away = np.linalg.norm(pose[..., :2] - pose[:, self.ego, None, :2], axis=-1) > self.region_m + BEYOND_BORDER_M
+        if len(self.finder.ends):
+            to_end = np.linalg.norm(pose[:, :, None, :2] - self.finder.ends, axis=-1).min(-1)
+            away |= (to_end < AT_END_M) & (self.object_type == ObjectType.VEHICLE)
+        away[:, self.ego] = False
+        self.present &= ~away
+
+    def _enter(
+        self, pose: Float[np.ndarray, "A 3"], velocity: Float[np.ndarray, "A 2"], present: Bool[np.ndarray, "A"],
+        is_free: Bool[np.ndarray, "A"], rng: np.random.Generator,
+    ) -> list[tuple[int, Float[np.ndarray, "5 3"], bool]]:  # fmt: skip
+        """Row and poses of each agent that enters a rollout, and True for vehicles parked beside the lane."""
+        gates = self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m)
+        gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-self.entries.expect(gates))))
+        entrants = self.entries.draw(gates, rng)
+        free = {int(kind): np.flatnonzero(is_free & (self.object_type == kind)).tolist() for kind in VISITORS}
+        others, others_velocity = pose[present, :2], velocity[present]
+        entered = []
+        for k in range(len(gates)):
+            heading = gates.heading[k] + entrants.turn_rad[k]
+            normal = np.array([-np.sin(gates.heading[k]), np.cos(gates.heading[k])])
+            position, along = (
+                gates.position[k] + entrants.left_m[k] * normal,
+                np.array([np.cos(heading), np.sin(heading)]),
+            )
+            speed = find_safe_speed(position, along, float(entrants.speed_mps[k]), others, others_velocity)
+            rows = free.get(int(entrants.object_type[k]), [])
+            if speed is None or not rows or np.linalg.norm(position - pose[self.ego, :2]) < EGO_GAP_M:
+                continue
+            times = STEP_S * np.arange(1, DECISION_STEPS + 1)[:, None]
+            path = np.concatenate([position + times * speed * along, np.full((DECISION_STEPS, 1), heading)], -1)
+            is_vehicle, is_beside = entrants.object_type[k] == ObjectType.VEHICLE, abs(entrants.left_m[k]) > PARKED_M
+            entered.append((rows.pop(), path, bool(is_vehicle and is_beside and speed < PARKED_MPS)))
+            others, others_velocity = np.vstack([others, position]), np.vstack([others_velocity, speed * along])
+        return entered
+
+
+def find_safe_speed(
+    position: Float[np.ndarray, "2"],
+    along: Float[np.ndarray, "2"],
+    speed_mps: float,
+    others: Float[np.ndarray, "k 2"],
+    velocity: Float[np.ndarray, "k 2"],
+) -> float | None:
+    """Speed to appear at: the wanted one, or less where braking at 3 m/s² could not avoid the agent ahead.
+
+    None where somebody is too near, or one behind could not brake.
+
+    Args:
+        position: Place to appear at.
+        along: Direction of travel, a unit vector.
+        speed_mps: Wanted speed.
+        others: Positions of the agents that are there.
+        velocity: Velocities of these, m/s.
+    """
+    offset = others - position
+    ahead, left = offset @ along, offset @ np.array([-along[1], along[0]])
+    is_beside = (np.abs(ahead) < STANDSTILL_GAP_M) & (np.abs(left) < BESIDE_M)
+    if is_beside.any() or (np.linalg.norm(offset, axis=-1) < ANYWHERE_M).any():
+        return None
+    in_lane = (np.abs(left) < LANE_HALF_WIDTH_M) & (np.abs(ahead) < LOOK_M)
+    pace = np.maximum(velocity @ along, 0.0)
+    room = 2 * BRAKING_MPS2 * np.maximum(np.abs(ahead) - STANDSTILL_GAP_M, 0.0)  # v² that braking takes away
+    leads = in_lane & (ahead > 0)
+    speed = min(speed_mps, float(np.sqrt((pace**2 + room)[leads].min(initial=np.inf))))
+    follows = in_lane & (ahead <= 0)
+    return None if (pace**2 - room > speed**2)[follows].any() else speed

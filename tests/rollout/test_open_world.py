@@ -1,0 +1,167 @@
+"""Worlds that agents leave and enter."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import rlftsim as rs
+import scenes
+from rlftsim.cli.main import main
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.entries import FittedEntries, fit_entries, load_entries, write_entries
+from rlftsim.rollout.gates import GateFinder
+from rlftsim.rollout.open_world import EGO_GAP_M, VISITORS, add_visitors, find_safe_speed
+from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import AgentStates
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.open import to_scenarios
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return to_scenarios("synthetic", "validation")[0]
+
+
+@pytest.fixture(scope="module")
+def rollouts(scenario):
+    return rs.simulate("demo-base", scenario, num_rollouts=2, seconds=20.0, entries="fixed-rate")
+
+
+def test_agents_leave_and_enter_far_from_the_ego_and_nobody_jumps(scenario, rollouts):
+    valid, position = rollouts.valid[0].numpy(), rollouts.position[0].numpy()  # [N, A, T]
+    ego = int(np.flatnonzero(scenario.simulated_indices == scenario.ego_index)[0])
+    is_there = valid[:, :, 1:] & valid[:, :, :-1]
+    assert np.linalg.norm(np.diff(position, axis=2), axis=-1)[is_there].max() < 4.0  # 40 m/s
+    appears = valid[:, :, 1:] & ~valid[:, :, :-1]
+    distance = np.linalg.norm(position - position[:, ego, None], axis=-1)
+    assert appears.any()
+    assert distance[:, :, 1:][appears].min() > EGO_GAP_M
+    assert (~valid[:, :, 1:] & valid[:, :, :-1]).any()
+    assert valid[:, ego].all()
+    assert distance[valid].max() < 150  # who waits is not there
+    assert not torch.equal(rollouts.valid[0, 0], rollouts.valid[0, 1])
+    assert not rollouts.decision_mask[0][~rollouts.valid[0, ..., ::5]].any()
+
+
+def test_the_same_seed_gives_the_same_world_and_without_entries_it_is_the_closed_one(scenario, rollouts):
+    again = rs.simulate("demo-base", scenario, num_rollouts=2, seconds=20.0, entries="fixed-rate")
+    assert torch.equal(again.valid, rollouts.valid)
+    assert torch.equal(again.position, rollouts.position)
+    closed = rs.simulate("demo-base", scenario, num_rollouts=1, seconds=2.0)
+    nobody = rs.simulate("demo-base", scenario, num_rollouts=1, seconds=2.0, entries="none")
+    count = len(scenario.simulated_indices)
+    stays = nobody.valid[0, :, :count].all(-1)
+    assert stays.sum() > 5
+    assert torch.allclose(nobody.position[0, :, :count][stays], closed.position[0][stays], atol=1e-3)
+    assert nobody.valid[0, :, count:].sum() == 0
+
+
+def test_an_agent_that_is_put_elsewhere_has_no_past(scenario):
+    policy, batch = load_policy("demo-base"), collate([scenario])
+    with torch.no_grad():
+        context = policy.encode(batch)
+        state = policy.begin(context, 1, None, torch.zeros(1, 1, batch.agent_mask.shape[1], 0))
+        decision = policy.decide(context, state).sample(rs.Sampling(), torch.full((*state.heading.shape, 1), 0.5))
+        poses = policy.advance(context, state, decision).poses
+        moved = poses.clone()
+        moved[:, :, 0, :, 0] += 500.0 + torch.arange(5) * 0.4
+        forced = impose(moved, agent=0)
+        state = policy.advance(context, state, decision, forced)
+    assert (state.past.row[:, :, 0] == -1).all()
+    assert (state.past.row[:, :, 1] >= 0).any()
+    assert torch.equal(state.poses[0, 0, 0], moved[0, 0, 0])
+    assert state.pending.motion[0, 0, 0, 0].norm() < 15  # not 500 m
+
+
+def impose(poses, agent):
+    valid = torch.zeros(poses.shape[:-1], dtype=torch.bool)
+    valid[:, :, agent] = True
+    return AgentStates(poses[..., :2], poses[..., 2], valid)
+
+
+def test_gates_are_where_lanes_cross_the_border():
+    road = scenes.straight_road()
+    gates = GateFinder(road).find(np.zeros(2), np.array([5.0, 0.0]), 60.0)
+    assert len(gates) > 0
+    assert np.allclose(np.linalg.norm(gates.position, axis=-1), 60.0, atol=2.1)
+    ahead = gates.position[:, 0] > 0
+    assert np.allclose(gates.standing_closing_mps, np.where(ahead, 5.0, -5.0), atol=0.3)
+
+
+def test_nobody_appears_where_braking_could_not_avoid_the_one_ahead():
+    east, still = np.array([1.0, 0.0]), np.zeros((1, 2))
+    assert find_safe_speed(np.zeros(2), east, 15.0, np.array([[200.0, 0.0]]), still) == 15.0
+    slowed = find_safe_speed(np.zeros(2), east, 15.0, np.array([[30.0, 0.0]]), still)
+    assert slowed == pytest.approx(np.sqrt(2 * 3 * 24))  # stops 6 m behind, at 3 m/s²
+    assert find_safe_speed(np.zeros(2), east, 15.0, np.array([[4.0, 1.0]]), still) is None
+    assert find_safe_speed(np.zeros(2), east, 2.0, np.array([[-20.0, 0.0]]), np.array([[20.0, 0.0]])) is None
+    assert find_safe_speed(np.zeros(2), east, 15.0, np.array([[4.0, 3.5]]), still) == 15.0  # beside
+
+
+def busy_log():
+    """A log in which vehicles become visible 60 m ahead of an ego that stands, one every second."""
+    road = scenes.straight_road()
+    steps = 300
+    tracks = road.tracks.select(np.repeat(road.ego_index, 30))
+    names = ("position", "heading", "velocity", "size")
+    still = {name: np.repeat(getattr(tracks, name)[:, 10:11], steps, 1) for name in names}
+    tracks = replace(tracks, **still, valid=np.zeros((30, steps), bool), object_id=np.arange(30))
+    tracks.velocity[0] = 0.0
+    tracks.valid[0] = True
+    ego = tracks.position[0, 0].copy()
+    for car in range(1, 30):
+        first = 10 * car
+        travel = 10.0 * 0.1 * np.arange(steps - first)
+        tracks.position[car, first:, 0] = ego[0] - 60.0 + travel
+        tracks.velocity[car] = (10.0, 0.0)
+        tracks.valid[car, first : first + 100] = True
+    return replace(
+        road, tracks=tracks, timestamps_s=np.round(np.arange(steps) * 0.1, 1), ego_index=0,
+        tracks_to_predict=np.zeros(0, np.int32), difficulty=np.zeros(0, np.int8),
+    )  # fmt: skip
+
+
+def test_fitted_entries_expect_what_the_log_had(tmp_path):
+    log = busy_log()
+    model = fit_entries([log])
+    gates = GateFinder(log).find(log.tracks.position[0, 10, :2] - log.origin, np.zeros(2), 60.0)
+    entered = 28  # in 28.5 s
+    assert model.expect(gates).sum() * 57 == pytest.approx(entered, rel=0.25)
+    assert np.median(model.entrants.speed_mps) == pytest.approx(10.0)
+    write_entries(tmp_path / "entries.npz", model)
+    read = load_entries(str(tmp_path / "entries.npz"))
+    assert isinstance(read, FittedEntries)
+    assert np.array_equal(read.expect(gates), model.expect(gates))
+    (tmp_path / "entries.npz").write_bytes(b"PK")
+    with pytest.raises(DataError, match="rlftsim entries fit"):
+        load_entries(str(tmp_path / "entries.npz"))
+
+
+def test_what_does_not_fit_is_refused_in_one_line(scenario):
+    with pytest.raises(ConfigError, match="did you mean 'fixed-rate'"):
+        rs.simulate("demo-base", scenario, num_rollouts=1, entries="fixed-rates")
+    with pytest.raises(ConfigError, match="agents enter every 5 steps"):
+        rs.simulate("constant_velocity", scenario, num_rollouts=1, entries="none")
+
+
+def test_rollouts_with_entries_are_files_that_play(scenario, tmp_path):
+    options = ["--data", "synthetic", "--scenario", scenario.scenario_id, "--num-rollouts", "1", "--seconds", "10"]
+    command = ["simulate", "demo-base", *options, "--entries", "fixed-rate", "--out", str(tmp_path / "out")]
+    assert main([*command, "--export", "page"]) == 0
+    with np.load(tmp_path / "out" / f"{scenario.scenario_id}.npz") as arrays:
+        assert arrays["valid"].shape == arrays["x"].shape
+        assert arrays["x"].shape[1] == len(scenario.simulated_indices) + sum(VISITORS.values())
+        assert not arrays["valid"].all()
+    assert (tmp_path / "out" / f"{scenario.scenario_id}.html").exists()
+
+
+def test_lights_of_the_log_are_seen_after_eight_seconds():
+    junction = scenes.junction_with_light()
+    policy, batch = load_policy("demo-base"), collate([add_visitors(junction)])
+    now, later = (policy.encode(replace(batch, light_step=step)) for step in (10, 80))
+    assert not torch.equal(now.scene.map_features, later.scene.map_features)  # red until step 50
+    assert torch.equal(now.scene.map_features, policy.encode(batch).scene.map_features)
+    assert simulate(policy, collate([junction]), num_rollouts=1, seed=0, num_steps=100).position.isfinite().all()
