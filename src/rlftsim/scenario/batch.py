@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -109,7 +109,7 @@ def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, fra
     # as long as the longest log; the 80 future steps of a test split are invalid
     num_steps = max(s.num_steps for s in scenarios)
     rows = [_agent_rows(s, num_agents, num_steps, compute_origin(s, frame)) for s in scenarios]
-    stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
+    stacked: dict[str, Any] = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
     return ScenarioBatch(scenarios=tuple(scenarios), **stacked, frame=frame)
 
 
