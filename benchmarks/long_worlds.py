@@ -12,9 +12,7 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
-
-import rlftsim as rs
-from rlftsim.evaluation.long_worlds import (
+from long_world_samples import (  # beside this file
     WindowSamples,
     compute_distance,
     join_samples,
@@ -22,6 +20,8 @@ from rlftsim.evaluation.long_worlds import (
     read_log,
     read_rollouts,
 )
+
+import rlftsim as rs
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.entries import ENTRIES, fit_entries
 from rlftsim.rollout.open_world import add_visitors

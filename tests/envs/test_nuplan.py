@@ -117,6 +117,8 @@ def light(connector, name):
 
 
 class Scenario:
+    token = "4f8a"
+
     @property
     def map_api(self):
         return Map()

@@ -1,5 +1,6 @@
 """Worlds that agents leave and enter."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ import rlftsim as rs
 import scenes
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.policies.calibrated.candidates import Traffic
 from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.edge_scenes import edge_scenes, without_future
 from rlftsim.rollout.entries import FittedEntries, fit_entries, load_entries, write_entries
 from rlftsim.rollout.gates import GateFinder
 from rlftsim.rollout.open_world import EGO_GAP_M, VISITORS, add_visitors, find_safe_speed
@@ -158,10 +161,48 @@ def test_rollouts_with_entries_are_files_that_play(scenario, tmp_path):
     assert (tmp_path / "out" / f"{scenario.scenario_id}.html").exists()
 
 
-def test_lights_of_the_log_are_seen_after_eight_seconds():
+def test_lights_of_the_log_are_seen_after_eight_seconds(monkeypatch):
     junction = scenes.junction_with_light()
     policy, batch = load_policy("demo-base"), collate([add_visitors(junction)])
     now, later = (policy.encode(replace(batch, light_step=step)) for step in (10, 80))
     assert not torch.equal(now.scene.map_features, later.scene.map_features)  # red until step 50
     assert torch.equal(now.scene.map_features, policy.encode(batch).scene.map_features)
+    steps, encode = [], type(policy).encode
+    monkeypatch.setattr(type(policy), "encode", lambda self, b: steps.append(b.light_step) or encode(self, b))
     assert simulate(policy, collate([junction]), num_rollouts=1, seed=0, num_steps=100).position.isfinite().all()
+    assert steps == [10, 90]
+
+
+def test_a_calibrated_model_sees_a_newcomer_by_where_it_drives():
+    traffic = Traffic(*(torch.zeros(1, 1, 1, 1, *shape) for shape in ((2,), (), (2,), (), ())))
+    x = 500.0 - torch.arange(1, 6)  # 10 m/s, to the west
+    poses = torch.stack([x, torch.zeros(5), torch.full((5,), torch.pi)], -1)[None, None, None]
+    after = traffic.advance(poses, 0.5)
+    assert after.speed.item() == pytest.approx(10.0, abs=1e-4)
+    assert after.turn.item() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_windows_of_a_log_are_scenarios_of_their_own(scenario):
+    assert scenario.window(0).scenario_id == scenario.scenario_id
+    assert scenario.window(5).scenario_id == f"{scenario.scenario_id}@5"
+
+
+def test_logs_without_lanes_or_without_future_say_that_nobody_enters(scenario):
+    for logs in ([], [edge_scenes(scenario)["no map"]], [without_future(scenario)]):
+        with pytest.raises(DataError, match="nobody enters"):
+            fit_entries(logs)
+
+
+def test_entries_of_a_batch_in_the_world_frame_are_refused(scenario):
+    with pytest.raises(ConfigError, match="map frame"):
+        rs.simulate("demo-base", collate([scenario], frame="world"), num_rollouts=1, seconds=1.0, entries="none")
+
+
+def test_files_of_others_have_no_agent_that_flies(scenario, tmp_path):
+    options = ["--data", "synthetic", "--scenario", scenario.scenario_id, "--num-rollouts", "1", "--seconds", "10"]
+    command = ["simulate", "demo-base", *options, "--entries", "fixed-rate", "--out", str(tmp_path / "out")]
+    assert main([*command, "--export", "gpudrive"]) == 0
+    [file] = tmp_path.rglob("tfrecord-*.json")
+    for agent in json.loads(file.read_text())["objects"]:
+        speed = [np.hypot(v["x"], v["y"]) for v, there in zip(agent["velocity"], agent["valid"]) if there]
+        assert max(speed, default=0.0) < 60.0

@@ -19,6 +19,7 @@ from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import Route, compute_headings
 from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW, Lights
 from rlftsim.envs.world import World, WorldState, find_lights, find_presence, padded
+from rlftsim.errors import ConfigError
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
 
@@ -170,6 +171,12 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), _FAR_M + 0j)
     middles = {name: array.mean(-1) for name, array in points.items()}
     middles |= {"lanes": points["lanes"][..., SEGMENT_POINTS // 2], "neighbors": space, "route": route_points}
+    largest = max(middles, key=lambda name: middles[name].size)
+    if middles[largest].size > _ROW_BITS:
+        raise ConfigError(
+            f"{len(rows)} agents with {middles[largest].shape[1]} {largest} each are too many to observe at once: make "
+            "fewer environments."
+        )
     index = {name: np.arange(middle.size).reshape(middle.shape) for name, middle in middles.items()}
     num_agents = world.mask.shape[1]
     index["neighbors"] = np.minimum(np.arange(space.shape[1]), num_agents - 1) + num_agents * rows[:, None]

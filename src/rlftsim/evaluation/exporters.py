@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Float64
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
@@ -208,13 +210,19 @@ def _outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
     return table
 
 
+def _find_path(states: SimulatedStates, agent_id: int) -> Float64[np.ndarray, "N T 2"]:
+    """Simulated path of an agent, NaN where the agent is absent."""
+    presence = states.presence[:, states.find_rows(np.array([agent_id]))[0], :, None]
+    return torch.where(presence, states.simulated_path(agent_id), torch.nan).numpy().astype(np.float64)
+
+
 def _draw_outcome(states: SimulatedStates, scenario: Scenario, entries: Sequence[GoalEntry]) -> GoalPanel:
     """Goals and the simulated paths of their agents; without goals the paths of the evaluated agents."""
     targeted = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
     # Without goals the picture shows the agents that the metric evaluates.
     free = [(agent, None, "") for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist()]
     marks = tuple(
-        DrawnGoal(agent_id, position, label, driven=states.simulated_path(agent_id).numpy().astype(np.float64))
+        DrawnGoal(agent_id, position, label, driven=_find_path(states, agent_id))
         for agent_id, position, label in targeted or free
     )
     return GoalPanel(scenario.scenario_id, scenario, marks)

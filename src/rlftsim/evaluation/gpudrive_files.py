@@ -11,6 +11,7 @@ import torch
 
 from rlftsim.jobs.files import write_text
 from rlftsim.realism import SimulatedStates
+from rlftsim.rollout.types import FARTHEST_STEP_M
 from rlftsim.scenario.gpudrive import ROAD_TYPES
 from rlftsim.scenario.types import HISTORY_STEPS, POLYGON_TYPES, STEP_S, LightState, ObjectType, Scenario
 
@@ -39,6 +40,8 @@ def write_gpudrive(scenario: Scenario, states: SimulatedStates, folder: Path) ->
     for number, future in enumerate(poses):  # [A, 80, 4]
         position = np.concatenate([tracks.position[:, history], future[..., :3]], 1)
         velocity = np.diff(position[:, HISTORY_STEPS - 1 :, :2], axis=1) / np.float32(STEP_S)
+        is_elsewhere = np.linalg.norm(velocity, axis=-1) * STEP_S > FARTHEST_STEP_M  # the first step of who enters
+        velocity[is_elsewhere] = np.roll(velocity, -1, axis=1)[is_elsewhere]
         motion = replace(
             tracks,
             position=position,

@@ -78,7 +78,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
             lines = [features.polyline(index) - origin for index in features.find_indices(types)]
             stream.log(f"map/{name}", rr.LineStrips3D(lines, colors=[color] * len(lines)), static=True)
         for number, rollout in enumerate(future):
-            lines = rollout[..., :3] - origin
+            lines = [path[is_there, :3] - origin for path, is_there in zip(rollout, presence[number])]
             stream.log(f"rollout_{number}/paths", rr.LineStrips3D(lines, colors=colors), static=True)
         for step in range(HISTORY_STEPS + future.shape[2]):
             stream.set_time("step", sequence=step)
@@ -105,7 +105,7 @@ def write_rerun(scenario: Scenario, states: SimulatedStates, folder: Path) -> Pa
 
 def _measure_events(scenario: Scenario, states: SimulatedStates) -> dict[str, np.ndarray]:
     """Fraction of evaluated agents that collide, or are off the road, at each step of the first rollouts, [N, T]."""
-    if not scenario.has_evaluated_future or states.x.shape[-1] != FUTURE_STEPS:
+    if not scenario.has_evaluated_future or states.x.shape[-1] != FUTURE_STEPS or states.valid is not None:
         return {}
     features = compute_features(scenario_log(scenario, states.device, missing_map="neutral"), states)
     events = {"collision": features.collision, "off_road": features.offroad}

@@ -59,9 +59,9 @@ class Simulation:
             "num_steps": self.num_steps,
             "sampling": asdict(self.sampling),
         }
-        entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
+        goal_entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
         entering = {} if self.entries is None else {"entries": identify_entries(self.entries)}
-        return identity | ({"goals": entries} if entries else {}) | entering
+        return identity | ({"goals": goal_entries} if goal_entries else {}) | entering
 
 
 def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> list[Path]:
@@ -114,11 +114,11 @@ def _simulate_scenario(
         return None
     scenario, name = simulation.dataset.by_id(scenario_id), simulation.entries
     batch = collate([scenario if name is None else add_visitors(scenario)]).to(get_device(simulation.policy))
-    entries = simulation.goals.of_scenario(scenario_id)
+    goal_entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
         num_steps=simulation.num_steps, sampling=simulation.sampling,
-        goals=goals_of_batch(entries, batch) if entries else None,
+        goals=goals_of_batch(goal_entries, batch) if goal_entries else None,
         entries=None if name is None else load_entries(name),
     )  # fmt: skip
     [path] = write_rollouts(out, batch, rollouts)

@@ -3,7 +3,7 @@
 A package of your own adds one:
 
 [project.entry-points."rlftsim.entries"]
-busy = "my_package:BusyEntries"
+busy = "my_package:BUSY"
 
 G gates, K entrants of logs.
 """
@@ -74,7 +74,7 @@ class EntryModel(Protocol):
 
 
 class NoEntries:
-    """Nobody enters: agents leave alone."""
+    """Nobody enters; agents only leave."""
 
     def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
         """Zeros."""
@@ -144,6 +144,8 @@ def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
     for scenario in scenarios:
         log, finder = _LoggedEntries(scenario), GateFinder(scenario)
         for step in range(CURRENT_STEP, scenario.num_steps - DECISION_STEPS, DECISION_STEPS):
+            if not log.valid[log.ego, step]:
+                continue
             gates = finder.find(log.position[log.ego, step], log.velocity[log.ego, step], log.region_m)
             if not len(gates):
                 continue
@@ -151,9 +153,9 @@ def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
             inputs.append(_describe(gates))
             counts.append(np.bincount(gate, minlength=len(gates)))
             rows.append(log.describe(gates, gate, entered, step))
-    entrants = Entrants(*(np.concatenate(values) for values in zip(*(vars(row).values() for row in rows))))
-    if not len(entrants.speed_mps):
+    if not any(len(row.speed_mps) for row in rows):
         raise DataError("nobody enters in these logs: take longer ones, as rlftsim synthesize --seconds 70 makes.")
+    entrants = Entrants(*(np.concatenate(values) for values in zip(*(vars(row).values() for row in rows))))
     x, y = np.concatenate(inputs), np.concatenate(counts)
     weights = np.array([np.log(y.mean()), 0.0, 0.0])
     for _ in range(NEWTON_STEPS):
@@ -226,7 +228,7 @@ def load_entries(name: str) -> EntryModel:
     if name.endswith(".npz"):
         return _read_entries(name)
     model = ENTRIES.get(name)
-    if not isinstance(model, EntryModel):
+    if isinstance(model, type) or not isinstance(model, EntryModel):
         raise ConfigError(f"entry model {name!r} is of type {type(model).__name__}: give it expect and draw.")
     return model
 

@@ -64,7 +64,9 @@ class GateFinder:
             follows.append(np.arange(count) < count - 1)
         self.points, self.heading = np.concatenate(points), np.concatenate(headings)
         self.speed, self.is_followed = np.concatenate(speeds), np.concatenate(follows)
-        ends = [line[-1, :2] - scenario.origin for line, next in zip(graph.lines, graph.successors) if not next]
+        ends = [
+            line[-1, :2] - scenario.origin for line, successors in zip(graph.lines, graph.successors) if not successors
+        ]
         self.ends = np.array(ends).reshape(-1, 2)
 
     def find(self, ego: Float[np.ndarray, "2"], ego_velocity: Float[np.ndarray, "2"], region_m: float) -> Gates:

@@ -47,8 +47,8 @@ LOOK_M = 80.0
 def add_visitors(scenario: Scenario) -> Scenario:
     """The scenario with rows for agents that may enter, which wait outside of the map; a row has one type and size."""
     tracks = scenario.tracks
-    types = np.repeat([int(kind) for kind in VISITORS], list(VISITORS.values())).astype(np.int8)
-    sizes = np.array([VISITOR_SIZE_M[ObjectType(int(kind))] for kind in types], np.float32)
+    types = np.repeat([int(object_type) for object_type in VISITORS], list(VISITORS.values())).astype(np.int8)
+    sizes = np.array([VISITOR_SIZE_M[ObjectType(int(object_type))] for object_type in types], np.float32)
     shape = (len(types), scenario.num_steps)
     position = np.zeros((*shape, 3), np.float32)
     position[..., 0] = scenario.origin[0] + WAITING_M + WAITING_GAP_M * np.arange(len(types))[:, None]
@@ -60,7 +60,7 @@ def add_visitors(scenario: Scenario) -> Scenario:
         heading=np.zeros(shape, np.float32),
         velocity=np.zeros((*shape, 2), np.float32),
         size=np.repeat(sizes[:, None], shape[1], 1),
-        valid=np.ones(shape, bool),
+        valid=np.broadcast_to(np.arange(shape[1]) == CURRENT_STEP, shape).copy(),
     )
     names = vars(visitors)
     joined = Tracks(**{name: np.concatenate([getattr(tracks, name), names[name]]) for name in names})
@@ -78,17 +78,18 @@ class OpenWorld:
         entries: Model of who enters.
 
     Raises:
-        ConfigError: Several scenarios, or a policy that does not decide every half second.
+        ConfigError: Several scenarios, another frame than the map's, or a policy that does not decide each half second.
     """
 
     def __init__(
         self, batch: ScenarioBatch, rollout_ids: Sequence[int], seed: int, steps_per_decision: int, entries: EntryModel
     ):
-        if steps_per_decision != DECISION_STEPS or batch.num_scenarios != 1:
+        if steps_per_decision != DECISION_STEPS or batch.num_scenarios != 1 or batch.frame != "map":
             raise ConfigError(
-                f"agents enter every {DECISION_STEPS} steps of one scenario, the policy decides every "
-                f"{steps_per_decision} of {batch.num_scenarios}: leave entries out."
+                f"agents enter every {DECISION_STEPS} steps of one scenario in the map frame, the policy decides every "
+                f"{steps_per_decision} of {batch.num_scenarios} in the {batch.frame} frame: leave entries out."
             )
+        self.device = batch.device
         (scenario,) = batch.scenarios
         self.entries, self.finder, self.region_m = entries, GateFinder(scenario), find_region_m(scenario)
         self.ego = int(np.flatnonzero(scenario.simulated_indices == scenario.ego_index)[0])
@@ -137,10 +138,8 @@ class OpenWorld:
                 self.present[n, agent], self.is_parked[n, agent] = True, is_parked
         self._valid.append(self.present.copy())
         poses, valid = torch.from_numpy(forced[None]).float(), torch.from_numpy(imposed)[None, :, :, None]
-        device = "cpu" if state.poses is None else state.poses.device
-        return AgentStates(
-            poses[..., :2].to(device), poses[..., 2].to(device), valid.expand(poses.shape[:-1]).to(device)
-        )
+        poses, valid = poses.to(self.device), valid.to(self.device)
+        return AgentStates(poses[..., :2], poses[..., 2], valid.expand(poses.shape[:-1]))
 
     def _remove(self, pose: Float[np.ndarray, "N A 3"]) -> None:
         """Agents that are beyond the border, or at the end of a lane that goes on nowhere, are absent from now on."""
@@ -159,7 +158,7 @@ class OpenWorld:
         gates = self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m)
         gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-self.entries.expect(gates))))
         entrants = self.entries.draw(gates, rng)
-        free = {int(kind): np.flatnonzero(is_free & (self.object_type == kind)).tolist() for kind in VISITORS}
+        free = {int(name): np.flatnonzero(is_free & (self.object_type == name)).tolist() for name in VISITORS}
         others, others_velocity = pose[present, :2], velocity[present]
         entered = []
         for k in range(len(gates)):

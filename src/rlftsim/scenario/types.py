@@ -422,10 +422,10 @@ class Scenario:
                 )
 
     def window(self, start: int, num_steps: int = TOTAL_STEPS) -> "Scenario":
-        """Some steps of the log as a scenario, in which "now" is ten steps after the first.
+        """Some steps of the log as a scenario of its own, in which "now" is ten steps after the first.
 
         Args:
-            start: First step of the window.
+            start: First step of the window; a later one than 0 is part of the id.
             num_steps: Length of the window; it ends earlier where the log does. 11 withhold the future.
         """
         steps, lights = slice(start, start + num_steps), self.lights
@@ -433,6 +433,7 @@ class Scenario:
         observed = {column.name: getattr(lights, column.name)[is_inside] for column in fields(lights)}
         return replace(
             self,
+            scenario_id=f"{self.scenario_id}@{start}" if start else self.scenario_id,
             timestamps_s=self.timestamps_s[steps],
             tracks=self.tracks.cut(steps),
             lights=LightStates(**observed | {"step": observed["step"] - observed["step"].dtype.type(start)}),

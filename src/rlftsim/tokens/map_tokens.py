@@ -172,6 +172,7 @@ def _find_lights(scenario: Scenario, step: int) -> dict[int, int]:
 def _relight(pieces: MapSegments, scenario: Scenario, step: int) -> MapSegments:
     """The pieces with the lights of another step, at most the last of the log."""
     lights = _find_lights(scenario, min(step, scenario.num_steps - 1))
+    lights.pop(-1, None)  # that of no lane, as pieces of other families have it
     return replace(pieces, light=np.array([lights.get(lane, 0) for lane in pieces.lane_id.tolist()], np.int8))
 
 

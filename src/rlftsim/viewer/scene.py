@@ -335,6 +335,9 @@ def rollout_trajectories(
     )
     if provenance is not None and provenance.frame != "map":
         future_position = (future_position - scenario.origin).astype(np.float32)
+    is_there = np.isfinite(future_position).all(-1) & np.isfinite(future_heading)
+    if rollouts.valid is not None:
+        is_there &= rollouts.valid[row, :max_rollouts, :num_agents].cpu().numpy()
     log = logged_trajectories(scenario)
 
     def join(past: np.ndarray, future: np.ndarray) -> np.ndarray:  # along the axis of steps
@@ -345,7 +348,7 @@ def rollout_trajectories(
     return SceneMotion(
         position=join(log.position, future_position),
         heading=join(log.heading, future_heading),
-        valid=join(log.valid, np.isfinite(future_position).all(-1) & np.isfinite(future_heading)),
+        valid=join(log.valid, is_there),
     )
 
 

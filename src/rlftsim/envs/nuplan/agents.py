@@ -157,7 +157,7 @@ class RlftsimAgents:
         for agent in self.agents:
             object_type = TYPES[agent.tracked_object_type.name]
             logged.append(self._log(agent.track_token, object_type, agent.box, times, seen[agent.track_token]))
-        scenario = build_session_scenario("nuplan", None, logged, int(times[-1]))
+        scenario = build_session_scenario(self.scenario.token, None, logged, int(times[-1]))
         lights = self.scenario.get_traffic_light_status_at_iteration(index)
         features, states = build_map(self.scenario.map_api, lights, self.origin)
         scenario = replace(scenario, map_features=features, lights=states, guessed=frozenset({"z"}))

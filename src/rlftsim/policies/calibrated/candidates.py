@@ -150,13 +150,14 @@ class Traffic:
             seconds: Duration of the decision, over which velocities are means.
         """
         position, heading = poses[..., -1:, :2], poses[..., -1:, 2]
-        before = self.position
+        before, before_heading = self.position, self.heading
         if poses.shape[3] > 1:  # somebody who is put elsewhere has moved within the decision alone
             is_elsewhere = (poses[..., :1, :2] - before).norm(dim=-1, keepdim=True) > FARTHEST_STEP_M
             before = torch.where(is_elsewhere, 2 * poses[..., :1, :2] - poses[..., 1:2, :2], before)
+            before_heading = torch.where(is_elsewhere[..., 0], poses[..., :1, 2], before_heading)
         velocity = (position - before) / seconds
-        speed = (velocity * heading_vector(self.heading)).sum(-1)
-        return Traffic(position, heading, velocity, speed, wrap_angle(heading - self.heading))
+        speed = (velocity * heading_vector(before_heading)).sum(-1)
+        return Traffic(position, heading, velocity, speed, wrap_angle(heading - before_heading))
 
 
 def join_moments(moments: Sequence[Traffic]) -> Traffic:
