@@ -1,10 +1,12 @@
 """The paper's order of rewards where noise is small: calibrations by each reward, all at the same measured KL.
 
 python benchmarks/reward_order.py OUT [--model demo-base] [--seeds 2]
+python benchmarks/reward_order.py OUT --compare OUT/exam/EXAM/evaluations
 
 Every reward sees the same rollouts of the training split, 16 of each scenario, a draw of them for each seed, and fits
 the same features under the same constraints; a row is fitted without constraints, too. The models, in OUT/REWARD-SEED,
-then sit an exam, by the command that is printed in the end. Credits of every reward are clipped alike and go to agents;
+then sit an exam, by the command that is printed in the end; `--compare` holds the rewards against the base and MLOO
+against each other, seed by seed, with intervals over street networks and seeds. Credits of every reward are clipped alike and go to agents;
 "mloo_by_rollout" gives each agent the reward of its rollout, as the paper does.
 """
 
@@ -16,15 +18,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rlftsim.evaluation.results import Evaluation
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import score_rollouts
 from rlftsim.rewards import compute_rewards, leave_one_out, parse_reward
+from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.open import open_dataset
+from rlftsim.statistics import cluster_bootstrap
 from rlftsim.training.calibrate import CONSTRAINTS, Recorder, natural_direction
 from rlftsim.training.config import CONSTRAINED_MEANS, FEATURES, CalibrateConfig
 from rlftsim.training.data import batch_with_futures
@@ -46,8 +51,12 @@ def main() -> None:
     parser.add_argument("--model", default="demo-base")
     parser.add_argument("--data", default="synthetic")
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--compare", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.compare:
+        compare(arguments.out, arguments.compare, arguments.seeds, arguments.model)
+        return
     scenarios = open_dataset(arguments.data, "training")
     policy = CalibratedPolicy(load_policy(arguments.model), FEATURES).eval().requires_grad_(False)
     names: dict[str, list[str]] = {}
@@ -70,6 +79,33 @@ def main() -> None:
                 print(f"{label}, seed {seed}: KL {kl:.4f} before the last scaling", flush=True)
     models = " ".join(f"{label}={','.join(folders)}" for label, folders in names.items())
     print(f"rlftsim experiment exam --models {models} --base-model {arguments.model} --out {arguments.out}/exam")
+
+
+def compare(models: Path, evaluations: Path, num_seeds: int, base: str) -> None:
+    """Print the RMM of each reward minus the base's, and MLOO's minus that of each other reward."""
+    read_all = map(Evaluation.read, evaluations.glob("*.parquet"))
+    stored = {evaluation.provenance.policy_fingerprint: evaluation for evaluation in read_all}
+    reference = stored[fingerprint_policy(load_policy(base))]
+    clusters = reference.clusters
+
+    def read(name: str) -> np.ndarray:
+        """RMM [seeds, scenarios] of the models that sat the exam."""
+        prints = [fingerprint_policy(load_policy(str(models / f"{name}-{seed}"))) for seed in range(num_seeds)]
+        return np.array([stored[print_]["meta_metric"] for print_ in prints if print_ in stored])
+
+    gains = {name: read(name) - reference["meta_metric"] for name in (*REWARDS, BY_ROLLOUT)}
+    for name, gain in gains.items():
+        print(f"{name}: {format_interval(gain, clusters)}", flush=True)
+    for name in [*gains][1:]:
+        count = min(len(gains["mloo"]), len(gains[name]))
+        difference = gains["mloo"][:count] - gains[name][:count]
+        print(f"mloo minus {name}: {format_interval(difference, clusters)}", flush=True)
+
+
+def format_interval(values: np.ndarray, clusters: np.ndarray) -> str:
+    """Mean with its 95 % interval over networks and seeds."""
+    interval = cluster_bootstrap(values, clusters)
+    return f"{interval.mean:+.4f} [{interval.interval[0]:+.4f}, {interval.interval[1]:+.4f}], {len(values)} seeds"
 
 
 def collect(
