@@ -146,7 +146,7 @@ def test_fitted_entries_expect_what_the_log_had(tmp_path):
 def test_what_does_not_fit_is_refused_in_one_line(scenario):
     with pytest.raises(ConfigError, match="did you mean 'fixed-rate'"):
         rs.simulate("demo-base", scenario, num_rollouts=1, entries="fixed-rates")
-    with pytest.raises(ConfigError, match="agents enter every 5 steps"):
+    with pytest.raises(ConfigError, match="agents enter every 0.5 s"):
         rs.simulate("constant_velocity", scenario, num_rollouts=1, entries="none")
 
 
@@ -206,3 +206,45 @@ def test_files_of_others_have_no_agent_that_flies(scenario, tmp_path):
     for agent in json.loads(file.read_text())["objects"]:
         speed = [np.hypot(v["x"], v["y"]) for v, there in zip(agent["velocity"], agent["valid"]) if there]
         assert max(speed, default=0.0) < 60.0
+
+
+def test_open_worlds_are_shown_with_their_newcomers_and_not_scored(scenario, rollouts):
+    assert "<canvas" in rs.show(scenario, rollouts).page
+    short = rs.simulate("demo-base", scenario, num_rollouts=1, entries="none")
+    for simulated in (rollouts, short):
+        with pytest.raises(DataError, match="agents leave and enter"):
+            rs.score(scenario, simulated)
+
+
+def test_what_does_not_fit_leaves_no_folder(tmp_path, capsys):
+    command = ["simulate", "--data", "synthetic", "--limit", "1", "--num-rollouts", "1", "--out", str(tmp_path / "out")]
+    for words, reason in (
+        (["demo-base", "--seconds", "0.3"], "decides for 0.5 s at a time"),
+        (["constant_velocity", "--entries", "none"], "take a SMART model"),
+    ):
+        assert main([command[0], words[0], *command[1:], *words[1:]]) == 2
+        assert reason in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+    assert main(["entries", "fit", "synthetic", str(tmp_path / "entries")]) == 2
+    assert "ends in .npz" in " ".join(capsys.readouterr().err.split())
+
+
+def test_stored_open_worlds_continue_and_are_refused_by_the_metric(scenario, tmp_path, capsys):
+    out = str(tmp_path / "out")
+    command = [
+        "simulate",
+        "demo-base",
+        "--data",
+        "synthetic",
+        "--scenario",
+        scenario.scenario_id,
+        "--num-rollouts",
+        "1",
+    ]
+    assert main([*command, "--entries", "none", "--out", out]) == 0
+    [file] = (tmp_path / "out").glob("*.npz")
+    changed = file.stat().st_mtime_ns
+    assert main([*command, "--entries", "none", "--out", out]) == 0
+    assert file.stat().st_mtime_ns == changed
+    assert main(["score", out, "--scenarios", "synthetic"]) == 2
+    assert "agents leave and enter" in " ".join(capsys.readouterr().err.split())

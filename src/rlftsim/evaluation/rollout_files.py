@@ -162,6 +162,8 @@ def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
 def _states_of_npz(entry: RolloutEntry, num_steps: int | None) -> SimulatedStates:
     arrays = _read_npz(entry.file, _KEYS[1:])
     valid = read_npz(entry.file, ("valid",), "write it again").get("valid")
+    if num_steps == FUTURE_STEPS and valid is not None:
+        raise DataError("agents leave and enter in these rollouts, which no metric is defined for: leave entries out.")
     ids = arrays.pop("object_ids")
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise DataError(f"object_ids must be whole numbers [A], got {ids.dtype} {list(ids.shape)}.")

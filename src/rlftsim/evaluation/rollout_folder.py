@@ -19,9 +19,9 @@ from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Runner
 from rlftsim.rollout.entries import identify_entries, load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.open_world import add_visitors
+from rlftsim.rollout.open_world import add_visitors, check_decisions
 from rlftsim.rollout.policy import Policy, Sampling, get_device
-from rlftsim.rollout.simulate import check_sampling, simulate
+from rlftsim.rollout.simulate import check_length, check_sampling, simulate
 from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -78,6 +78,9 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
         NotYetError: A second driver at work in the folder.
         SetAside, Unfinished: See `run_items`.
     """
+    check_length(simulation.policy, simulation.num_steps)
+    if simulation.entries is not None:
+        check_decisions(simulation.policy.steps_per_decision)
     check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
     identity = simulation.describe()
     rollouts = WholeFiles[str](out, "{}.npz".format, partial(_validate_file, simulation))
@@ -101,7 +104,8 @@ def _validate_file(simulation: Simulation, path: Path) -> Path:
         DataError: Damaged file, or other rollouts than those of the scenario that the file is named after.
     """
     entries = [entry for entry in find_rollouts(path) if entry.scenario_id == path.stem]
-    if [len(read_states(entry, simulation.num_steps).x) for entry in entries] != [simulation.num_rollouts]:
+    shapes = [read_states(entry, None).x.shape[::2] for entry in entries]  # (N, T)
+    if shapes != [(simulation.num_rollouts, simulation.num_steps)]:
         raise DataError(f"{path}: it holds other rollouts than {simulation.num_rollouts} of its scenario.")
     return path
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.realism.config import SCENARIO_GEN, SIM_AGENTS, Challenge
-from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, ObjectType, Scenario
 
 NUM_HISTORY_STEPS = 2
 """Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
@@ -324,7 +324,12 @@ def join_history(
     Raises:
         DataError: The agents of the rollouts are not those of the scenario, or the steps those of another challenge.
     """
-    if states.challenge != agents.challenge or states.x.shape[-1] != agents.challenge.num_steps:
+    if states.challenge == agents.challenge and states.x.shape[-1] != agents.challenge.num_steps:
+        raise DataError(
+            f"scenario {scenario_id}: the metric compares {agents.challenge.num_steps} steps, these rollouts have "
+            f"{states.x.shape[-1]}: simulate {agents.challenge.num_steps * STEP_S:g} seconds."
+        )
+    if states.challenge != agents.challenge:
         raise DataError(
             f"scenario {scenario_id}: {agents.challenge.title} scores {agents.challenge.num_steps} steps of an agent, "
             f"and these rollouts have {states.x.shape[-1]} in the form of {states.challenge.title}: name a metric of "

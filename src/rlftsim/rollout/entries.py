@@ -227,6 +227,8 @@ def load_entries(name: str) -> EntryModel:
     """
     if name.endswith(".npz"):
         return _read_entries(name)
+    if Path(name).is_file():
+        raise ConfigError(f"{name}: a file of entries ends in .npz: rename it.")
     model = ENTRIES.get(name)
     if isinstance(model, type) or not isinstance(model, EntryModel):
         raise ConfigError(f"entry model {name!r} is of type {type(model).__name__}: give it expect and draw.")
@@ -262,7 +264,10 @@ def _read_entries(path: str) -> FittedEntries:
     columns = [arrays.get(name) for name in names]
     lengths = {column.shape for column in columns[1:] if column is not None}
     are_numbers = all(c is not None and c.ndim == 1 and c.dtype.kind in "if" and np.isfinite(c).all() for c in columns)
-    if not are_numbers or len(lengths) != 1 or lengths == {(0,)} or arrays["weights"].shape != (3,):
+    is_right = are_numbers and len(lengths) == 1 and lengths != {(0,)} and arrays["weights"].shape == (3,)
+    if is_right:
+        is_right = np.isin(arrays["object_type"], (1, 2, 3)).all() and (arrays["speed_mps"] >= 0).all()
+    if not is_right:
         raise DataError(f"{path}: no {', '.join(names)} as finite numbers of equal length in it: {remedy}.")
     # the values of a file may be anything: rates stay below one entry per gate and half second, speeds below 180 km/h
     weights, *entrants = (column.clip(-50, 50) for column in columns if column is not None)

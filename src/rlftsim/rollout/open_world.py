@@ -67,6 +67,22 @@ def add_visitors(scenario: Scenario) -> Scenario:
     return replace(scenario, tracks=joined)
 
 
+def check_decisions(steps_per_decision: int) -> None:
+    """Check that a policy decides as often as agents enter.
+
+    Args:
+        steps_per_decision: Steps of 0.1 s that a decision of the policy lasts.
+
+    Raises:
+        ConfigError: It decides more often, or less.
+    """
+    if steps_per_decision != DECISION_STEPS:
+        raise ConfigError(
+            f"agents enter every {DECISION_STEPS * STEP_S:g} s, this model decides every "
+            f"{steps_per_decision * STEP_S:g} s: take a SMART model, or leave entries out."
+        )
+
+
 class OpenWorld:
     """Who is there in N rollouts of a scenario.
 
@@ -84,10 +100,11 @@ class OpenWorld:
     def __init__(
         self, batch: ScenarioBatch, rollout_ids: Sequence[int], seed: int, steps_per_decision: int, entries: EntryModel
     ):
-        if steps_per_decision != DECISION_STEPS or batch.num_scenarios != 1 or batch.frame != "map":
+        check_decisions(steps_per_decision)
+        if batch.num_scenarios != 1 or batch.frame != "map":
             raise ConfigError(
-                f"agents enter every {DECISION_STEPS} steps of one scenario in the map frame, the policy decides every "
-                f"{steps_per_decision} of {batch.num_scenarios} in the {batch.frame} frame: leave entries out."
+                f"agents enter one scenario in the map frame, not {batch.num_scenarios} in the {batch.frame} frame: "
+                "hand over each in the map frame, or leave entries out."
             )
         self.device = batch.device
         (scenario,) = batch.scenarios

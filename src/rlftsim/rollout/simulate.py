@@ -18,7 +18,7 @@ from rlftsim.rollout.open_world import OpenWorld
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, Scenarios
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenarios
 
 RELIT_STEPS = 20
 """After the metric's 8 s agents see the lights of the log, anew every 2 s; within these they see those of "now"."""
@@ -77,11 +77,12 @@ def simulate(
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
     stride = policy.steps_per_decision
-    if len(rollout_ids) < 1 or num_steps < 1 or num_steps % stride or FUTURE_STEPS % stride:
+    if len(rollout_ids) < 1 or FUTURE_STEPS % stride:
         raise ConfigError(
-            f"cannot simulate {len(rollout_ids)} rollouts of {num_steps} steps with {stride} steps per decision: "
-            f"need >= 1, and a divisor of {num_steps} and of {FUTURE_STEPS}."
+            f"cannot simulate {len(rollout_ids)} rollouts with {stride} steps per decision: "
+            "need >= 1 and a divisor of 80."
         )
+    check_length(policy, num_steps)
     if goals is not None and num_steps != FUTURE_STEPS:
         raise ConfigError(
             f"goals are due after {FUTURE_STEPS} steps, not after {num_steps}: simulate 8 seconds, or leave goals out."
@@ -154,6 +155,24 @@ def _draw_decision_noise(
         per_agent = per_block * policy.noise_size
         noise = draw_noise(batch, rollout_ids, seed=seed, purpose=purpose, per_agent=per_agent)
         yield from noise.unflatten(-1, (per_block, -1)).unbind(-2)
+
+
+def check_length(policy: Policy, num_steps: int) -> None:
+    """Check that decisions of a policy fill a number of steps.
+
+    Args:
+        policy: Policy that decides for some steps at once.
+        num_steps: Number of simulated steps.
+
+    Raises:
+        ConfigError: The length of a decision does not divide the steps.
+    """
+    stride = policy.steps_per_decision
+    if num_steps < 1 or num_steps % stride:
+        raise ConfigError(
+            f"this model decides for {stride * STEP_S:g} s at a time: seconds must be a multiple, got "
+            f"{num_steps * STEP_S:g}."
+        )
 
 
 def check_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:

@@ -43,7 +43,8 @@ def count_steps(seconds: float) -> int:
     Raises:
         ConfigError: A time that is no such multiple.
     """
-    steps = round(seconds / STEP_S) if 0 < seconds < MAX_SECONDS else 0
+    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    steps = round(seconds / STEP_S) if is_number and 0 < seconds < MAX_SECONDS else 0
     if steps < 1 or abs(steps * STEP_S - seconds) > 1e-6:
         raise ConfigError(
             f"seconds must be a multiple of {STEP_S:g} above 0 and below {MAX_SECONDS:g}, got {in_short(seconds)}."

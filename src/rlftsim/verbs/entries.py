@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import print_line
 from rlftsim.rollout.entries import fit_entries, write_entries
 from rlftsim.scenario.open import open_dataset
@@ -20,8 +21,11 @@ def fit(data: Name, out: Path, *, split: str = "training") -> None:
         split: Split of the data set.
 
     Raises:
+        ConfigError: A name of the file that does not end in .npz.
         DataError: Nobody enters in these logs, or the file cannot be written.
     """
+    if out.suffix != ".npz":
+        raise ConfigError(f"{out}: a file of entries ends in .npz: name another --out.")
     dataset = open_dataset(data, split)
     model = fit_entries([dataset[position] for position in range(len(dataset))])
     write_entries(out, model)

@@ -120,7 +120,7 @@ def simulate(
             numbers.
     """
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed, 0)
-    num_steps, entry_model = count_steps(seconds), None if entries is None else load_entries(entries)
+    num_steps, entry_model = count_steps(seconds), None if entries is None else load_entries(str(entries))
     limit = None if limit is None else whole_number("limit", limit, 1)
     sampling = to_sampling(sampling)
     if out is None:
@@ -148,7 +148,9 @@ def simulate(
     ids = list(dict.fromkeys(scenario or file.scenario_ids or dataset.scenario_ids))[:limit]
     check_scenarios(ids, file, dataset, str(dataset.folder if scenarios is dataset else scenarios), bool(scenario))
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(ids))
-    simulation = Simulation(model, dataset, tuple(ids), num_rollouts, num_steps, seed, sampling, file, name, entries)
+    simulation = Simulation(
+        model, dataset, tuple(ids), num_rollouts, num_steps, seed, sampling, file, name, entries and str(entries)
+    )
     paths = simulate_folder(simulation, Path(out), runner=runner)
     # also of rollouts that an earlier call has written
     report_rollouts(Path(out), dataset, ids, file, picture=picture, exporters=exporters)

@@ -131,6 +131,9 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
     animations = []
     for row in range(min(len(scenarios), MAX_SCENARIOS)):
         log = scenarios[row]
+        for simulated in rollouts:
+            if simulated.valid is not None and simulated.provenance is not None:  # with the agents that enter
+                log = simulated.provenance.scenarios[simulated.find_row(log.scenario_id)]
         scene = build_scene(log)
         panels = [Panel("logged", logged_trajectories(log).with_overlaps(scene.agents))]
         for name, simulated in zip(names, rollouts):
