@@ -55,7 +55,7 @@ def test_trafficbots_goes_on_with_the_lights_of_the_eighth_second():
 
 
 def test_other_lengths_are_refused_in_one_line(scenario):
-    with pytest.raises(ConfigError, match=r"for 0.5 s at a time: seconds must be a multiple, got 7.3"):
+    with pytest.raises(ConfigError, match=r"for 0\.5 s at a time: seconds must be a multiple, got 7\.3"):
         rs.simulate("demo-base", scenario, num_rollouts=1, seconds=7.3)
     with pytest.raises(ConfigError, match=r"seconds must be a multiple of 0\.1 above 0"):
         rs.simulate("demo-base", scenario, num_rollouts=1, seconds=0.0)

@@ -146,7 +146,7 @@ def test_fitted_entries_expect_what_the_log_had(tmp_path):
 def test_what_does_not_fit_is_refused_in_one_line(scenario):
     with pytest.raises(ConfigError, match="did you mean 'fixed-rate'"):
         rs.simulate("demo-base", scenario, num_rollouts=1, entries="fixed-rates")
-    with pytest.raises(ConfigError, match="agents enter every 0.5 s"):
+    with pytest.raises(ConfigError, match=r"agents enter every 0\.5 s"):
         rs.simulate("constant_velocity", scenario, num_rollouts=1, entries="none")
 
 
