@@ -63,7 +63,7 @@ def test_other_lengths_are_refused_in_one_line(scenario):
     goals = {ego: tuple((scenario.origin + 10).tolist())}
     with pytest.raises(ConfigError, match="goals are due after 80 steps, not after 100"):
         rs.simulate("demo-goals", scenario, num_rollouts=1, seconds=10.0, goals=goals)
-    with pytest.raises(DataError, match="scores 80 steps of an agent, and these rollouts have 100"):
+    with pytest.raises(DataError, match="compares 80 steps, these rollouts have 100"):
         rs.score(scenario, rs.simulate("constant_velocity", scenario, num_rollouts=1, seconds=10.0))
 
 
