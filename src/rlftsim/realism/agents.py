@@ -332,7 +332,7 @@ def join_history(
     if states.challenge != agents.challenge:
         raise DataError(
             f"scenario {scenario_id}: {agents.challenge.title} scores {agents.challenge.num_steps} steps of an agent, "
-            f"and these rollouts have {states.x.shape[-1]} in the form of {states.challenge.title}: name a metric of "
+            f"and these rollouts have the {states.challenge.num_steps} of {states.challenge.title}: name a metric of "
             "that challenge; `rlftsim evaluate` makes the rollouts that its metric wants."
         )
     order = match_agents(agents.object_id, states.object_id, scenario_id)
