@@ -21,7 +21,7 @@ def test_the_speed_table_has_a_line_for_each_row_and_continues_where_it_was_stop
     rows = [line for line in first.splitlines() if line.startswith("| metric, 32 rollouts")]
     assert len(rows) == 1
     assert 0 < float(rows[0].split("|")[5]) < 60  # CPU seconds of this version
-    assert torch.cuda.is_available() or "| rollouts, tiny, A | no GPU |" in first
+    assert torch.cuda.is_available() or "| rollouts, tiny, A, 32-true | no GPU |" in first
     assert rows[0] in again  # to the last digit: kept, not measured again
     assert rows[0] in (tmp_path / "table.md").read_text()
 
