@@ -10,7 +10,7 @@ from rlftsim.verbs.arguments import Name
 
 
 def fit(data: Name, out: Path, *, split: str = "training") -> None:
-    """Fit a model of who enters, for `rlftsim simulate --entries FILE.npz`.
+    """Fit a model of who enters a world, and how fast, to long logs, for `rlftsim simulate --entries FILE.npz`.
 
     A Poisson regression on the speeds at which the traffic of a lane and standing agents come nearer, and the agents
     that entered in the logs.
