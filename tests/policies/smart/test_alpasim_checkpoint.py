@@ -146,13 +146,13 @@ def test_a_map_without_usable_lines_has_the_piece_out_of_reach():
 
 class Calls:
     def __reduce__(self):
-        return print, ("run",)
+        return eval, ("print('run')",)
 
 
 @pytest.mark.parametrize("content", [Calls(), {"traj_src": Calls()}, {"traj_src": np.array([Calls()], object)}])
 def test_a_pickle_that_would_run_code_is_refused_by_name(tmp_path, capsys, content):
     (tmp_path / "t.pkl").write_bytes(pickle.dumps(content))
-    with pytest.raises(CheckpointError, match=r"t\.pkl: (refused, it holds builtins\.print|damaged)"):
+    with pytest.raises(CheckpointError, match=r"t\.pkl: (refused, it holds builtins\.eval|damaged)"):
         read_pickled_arrays(tmp_path / "t.pkl")
     assert "run" not in capsys.readouterr().out
 
