@@ -66,7 +66,8 @@ class World:
     """Length and width."""
     height: Float[np.ndarray, "B A"]
     object_type: Int64[np.ndarray, "B A"]
-    logged: Float[np.ndarray, "B A 91 5"]
+    logged_steps: Float[np.ndarray, "91 B A 5"]
+    """Logged motion, the numbers of a step side by side."""
     logged_z: Float[np.ndarray, "B A 91"]
     valid: Bool[np.ndarray, "B A 91"]
     policy: Policy | None
@@ -93,10 +94,10 @@ class World:
         drivers = self.drivers[scene, agent]
         return {driver: (scene[drivers == driver], agent[drivers == driver]) for driver in Driver}
 
-    @cached_property
-    def logged_steps(self) -> Float[np.ndarray, "91 B A 5"]:
-        """`logged`, one step after the other."""
-        return np.ascontiguousarray(np.moveaxis(self.logged, 2, 0))
+    @property
+    def logged(self) -> Float[np.ndarray, "B A 91 5"]:
+        """Logged motion of each agent; a view."""
+        return np.moveaxis(self.logged_steps, 0, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +199,9 @@ def build_world(
         size=padded([scene.size[:, :2] for scene in scenes], (*shape, 2)),
         height=padded([scene.size[:, 2] for scene in scenes], shape),
         object_type=padded([scene.object_type for scene in scenes], shape, 0),
-        logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
+        logged_steps=np.ascontiguousarray(
+            np.moveaxis(padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)), 2, 0)
+        ),
         logged_z=padded([scene.logged_z for scene in scenes], (*shape, TOTAL_STEPS)),
         valid=valid,
         is_present=is_present,
@@ -241,7 +244,7 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
             block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
         noise = _decision_noise(world, dice)
     idm_states = tuple(begin_idm(lines, scene) for scene, lines in zip(world.scenes, world.lines))
-    track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
+    track = tuple(world.logged_steps[: CURRENT_STEP + 1].copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
     sumo_states = tuple(begin_sumo(sumo_scene, scene) for sumo_scene, scene in zip(world.sumo_scenes, world.scenes))
     return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states)

@@ -13,7 +13,8 @@ from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score, score_batch
-from rlftsim.realism.from_rollouts import check_closed, states_of_rollouts
+from rlftsim.realism.agents import check_closed
+from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.open_world import add_visitors
@@ -149,7 +150,7 @@ def score_in_memory(batch: ScenarioBatch, rollouts: Rollouts, metric: str, *, is
         ConfigError: Rollouts of other scenarios, or no such metric.
         DataError: A pose that is not finite, or a scenario that cannot be scored.
     """
-    check_closed(rollouts.valid)
+    check_closed(rollouts.valid)  # before agents are compared: those that enter are in no log
     batch = _match_batch(batch, rollouts)
     # in the world frame and without padding
     states, config = states_of_rollouts(batch, rollouts), metric_by_name(metric)

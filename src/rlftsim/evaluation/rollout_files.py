@@ -22,6 +22,7 @@ from rlftsim.jobs.arrays import read_npz
 from rlftsim.jobs.documents import check_has_end
 from rlftsim.jobs.files import describe_type
 from rlftsim.realism import SimulatedStates
+from rlftsim.realism.agents import check_closed
 from rlftsim.scenario.types import FUTURE_STEPS
 
 FORMATS_NOTE = "see docs/rollout_formats.md"
@@ -162,8 +163,8 @@ def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
 def _states_of_npz(entry: RolloutEntry, num_steps: int | None) -> SimulatedStates:
     arrays = _read_npz(entry.file, _KEYS[1:])
     valid = read_npz(entry.file, ("valid",), "write it again").get("valid")
-    if num_steps == FUTURE_STEPS and valid is not None:
-        raise DataError("agents leave and enter in these rollouts, which no metric is defined for: leave entries out.")
+    if num_steps == FUTURE_STEPS:
+        check_closed(valid)
     ids = arrays.pop("object_ids")
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise DataError(f"object_ids must be whole numbers [A], got {ids.dtype} {list(ids.shape)}.")

@@ -309,6 +309,19 @@ def match_agents(
     return order[np.searchsorted(rollout_ids[order], logged_ids)]
 
 
+def check_closed(valid: object) -> None:
+    """Check that all agents are there all the time.
+
+    Args:
+        valid: Steps at which agents are there; None = always.
+
+    Raises:
+        DataError: Agents leave and enter.
+    """
+    if valid is not None:
+        raise DataError("agents leave and enter in these rollouts, which no metric is defined for: leave entries out.")
+
+
 def join_history(
     agents: LoggedAgents, states: SimulatedStates, scenario_id: str
 ) -> tuple[Trajectories, Float[Tensor, "#N A #T 3"]]:
@@ -322,8 +335,10 @@ def join_history(
         scenario_id: Scenario that messages name.
 
     Raises:
-        DataError: The agents of the rollouts are not those of the scenario, or the steps those of another challenge.
+        DataError: The agents of the rollouts are not those of the scenario, they leave and enter, or the steps are
+            those of another challenge.
     """
+    check_closed(states.valid)
     if states.challenge == agents.challenge and states.x.shape[-1] != agents.challenge.num_steps:
         raise DataError(
             f"scenario {scenario_id}: the metric compares {agents.challenge.num_steps} steps, these rollouts have "

@@ -13,30 +13,13 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, TOTAL_STEPS, Scenario
 
 
-def check_closed(valid: object) -> None:
-    """Check that all agents are there all the time.
-
-    Args:
-        valid: Steps at which agents are there; None = always.
-
-    Raises:
-        DataError: Agents leave and enter.
-    """
-    if valid is not None:
-        raise DataError("agents leave and enter in these rollouts, which no metric is defined for: leave entries out.")
-
-
 def states_of_rollouts(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[SimulatedStates, ...]:
     """Each scenario's rollouts without padding, in the world frame. Agents keep the height of the current step.
 
     Args:
         batch: Scenarios that were simulated, padded to the same number of agents.
         rollouts: N rollouts of each scenario, in the frame of the batch.
-
-    Raises:
-        DataError: Agents leave and enter in the rollouts, which no metric is defined for.
     """
-    check_closed(rollouts.valid)
     world = batch.to_world(rollouts.position)  # [B, N, A, T, 2]
     states = []
     for b, scenario in enumerate(batch.scenarios):
@@ -44,7 +27,8 @@ def states_of_rollouts(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[Simula
         position, heading = world[b, :, :count], rollouts.heading[b, :, :count]
         z = batch.z[b, :count, CURRENT_STEP, None].expand_as(heading)  # [N, A, T]
         ids = scenario.tracks.object_id[scenario.simulated_indices]
-        states.append(SimulatedStates(ids, position[..., 0], position[..., 1], z, heading))
+        valid = None if rollouts.valid is None else rollouts.valid[b, :, :count]
+        states.append(SimulatedStates(ids, position[..., 0], position[..., 1], z, heading, valid=valid))
     return tuple(states)
 
 
