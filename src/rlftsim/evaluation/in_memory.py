@@ -1,4 +1,4 @@
-"""Rollouts and scores in memory, without files: `rs.simulate` and `rs.score`."""
+"""Rollouts in memory, without files: `rs.simulate`."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,15 +7,11 @@ from typing import Any
 import torch
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.goals.lane_paths import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.progress import progress_bar
-from rlftsim.realism import RealismResult, metric_by_name, score, score_batch
-from rlftsim.realism.agents import check_closed
-from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.entries import EntryModel
+from rlftsim.rollout.entries import load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, is_goal_conditioned
@@ -33,7 +29,7 @@ def simulate_in_memory(
     num_steps: int,
     sampling: Sampling,
     goals: Any,
-    entries: EntryModel | None = None,
+    entries: str | None = None,
 ) -> Rollouts:
     """Rollouts of a batch with their provenance, simulated scenario by scenario.
 
@@ -45,13 +41,15 @@ def simulate_in_memory(
         num_steps: Number of simulated steps of 0.1 s.
         sampling: Temperature and truncation of the decisions.
         goals: Points, or goals of the whole batch, as for `rs.simulate`; None = goal-free.
-        entries: Model of who enters; the scenarios of the rollouts have visitors then. None = nobody enters or leaves.
+        entries: Name or file of the model of who enters; the scenarios of the rollouts have visitors then. None =
+            nobody enters or leaves.
 
     Raises:
         ConfigError: Goals of a wrong type, frame, batch or number of rollouts, or without effect on the policy.
         DataError: A goal of an agent that is not simulated, a goal out of reach, or not two finite numbers.
     """
-    if entries is not None:
+    entry_model = None if entries is None else load_entries(entries)
+    if entry_model is not None:
         batch = collate([add_visitors(scenario) for scenario in batch.scenarios], frame=batch.frame).to(batch.device)
     placed = _place_goals(goals, batch, num_rollouts)
     has_goals = placed.goal_mask.any(-1).any(-1).tolist()  # [B]
@@ -72,7 +70,7 @@ def simulate_in_memory(
             simulated.append(
                 simulate(
                     policy, scenario_batch, num_rollouts=num_rollouts, seed=seed, num_steps=num_steps,
-                    goals=scenario_goals, sampling=sampling, entries=entries,
+                    goals=scenario_goals, sampling=sampling, entries=entry_model,
                 )
             )  # fmt: skip
             advance()
@@ -135,56 +133,3 @@ def _check_reach(goals: Goals, batch: ScenarioBatch) -> None:
             f"{distance_m:.0f} m away, out of reach in {HORIZON_S:g} s: x and y are meters in the world frame of the "
             "log."
         )
-
-
-def score_in_memory(batch: ScenarioBatch, rollouts: Rollouts, metric: str, *, is_single: bool) -> RealismResult:
-    """Scores of rollouts, with a warning for each doubt.
-
-    Args:
-        batch: Scenarios with logged futures, in any frame.
-        rollouts: Rollouts of all scenarios of the batch, in the same order.
-        metric: Year of the meta-metric.
-        is_single: True leaves out the leading axis of B scenarios, for a batch of a single scenario.
-
-    Raises:
-        ConfigError: Rollouts of other scenarios, or no such metric.
-        DataError: A pose that is not finite, or a scenario that cannot be scored.
-    """
-    check_closed(rollouts.valid)  # before agents are compared: those that enter are in no log
-    batch = _match_batch(batch, rollouts)
-    # in the world frame and without padding
-    states, config = states_of_rollouts(batch, rollouts), metric_by_name(metric)
-    for scenario, simulated in zip(batch.scenarios, states):
-        simulated.check_finite(scenario.scenario_id)
-    scored = score(batch.scenarios[0], states[0], config) if is_single else score_batch(batch.scenarios, states, config)
-    for scenario, simulated in zip(batch.scenarios, states):
-        warn_of_doubts(scenario, simulated)
-    return scored
-
-
-def _match_batch(batch: ScenarioBatch, rollouts: Rollouts) -> ScenarioBatch:
-    """The scenarios that rollouts are of, in the frame of the rollouts.
-
-    Raises:
-        ConfigError: Rollouts of other scenarios: by the ids of scenarios and agents where the rollouts have ids, else
-            by numbers.
-    """
-    about = rollouts.provenance
-    if about is not None:
-        ids = tuple(scenario.scenario_id for scenario in batch.scenarios)
-        if about.scenario_ids != ids:
-            simulated = ", ".join(about.scenario_ids[:3])
-            raise ConfigError(
-                f"rollouts of {simulated} do not belong to {', '.join(ids[:3])}: hand over the same scenarios."
-            )
-        for row, scenario in enumerate(batch.scenarios):
-            about.check_same_agents(row, scenario)
-        if batch.frame != about.frame:
-            batch = collate(batch.scenarios, frame=about.frame).to(batch.device)
-    num_scenarios, _, num_agents = rollouts.position.shape[:3]
-    if num_scenarios != batch.num_scenarios or num_agents < batch.agent_mask.shape[1]:
-        raise ConfigError(
-            f"rollouts of {num_scenarios} scenarios with up to {num_agents} agents do not belong to "
-            f"{batch.num_scenarios} with up to {batch.agent_mask.shape[1]}: hand over the same scenarios."
-        )
-    return batch

@@ -3,65 +3,28 @@
 An interrupted simulation goes on; files that are damaged or cut off are made again.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
-from rlftsim.goals.goals_file import GoalsFile
+from rlftsim.evaluation.simulation import Simulation
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Runner
-from rlftsim.rollout.entries import identify_entries, load_entries
-from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.entries import load_entries
 from rlftsim.rollout.open_world import add_visitors, check_decisions
-from rlftsim.rollout.policy import Policy, Sampling, get_device
+from rlftsim.rollout.policy import get_device
 from rlftsim.rollout.simulate import check_length, check_sampling, simulate
 from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.dataset import ScenarioDataset
 
 ABOUT = "rollouts.json"
 """Model and settings of the rollouts in a folder."""
-
-
-@dataclass(frozen=True, eq=False)
-class Simulation:
-    """Input of a simulation; is handed to worker processes."""
-
-    policy: Policy
-    dataset: ScenarioDataset
-    scenario_ids: Sequence[str]
-    """In the order of the work."""
-    num_rollouts: int
-    num_steps: int
-    seed: int
-    sampling: Sampling
-    goals: GoalsFile
-    model: str
-    """Name of the model, for people who read the description."""
-    entries: str | None = None
-    """Name or file of the model of who enters; None = nobody enters or leaves."""
-
-    def describe(self) -> dict[str, Any]:
-        """Values on which the rollouts depend, in types of JSON, and the name of the model, which may change."""
-        identity = {
-            "model": self.model,
-            "policy": fingerprint_policy(self.policy),
-            "data": self.dataset.fingerprint,
-            "seed": self.seed,
-            "num_rollouts": self.num_rollouts,
-            "num_steps": self.num_steps,
-            "sampling": asdict(self.sampling),
-        }
-        goal_entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
-        entering = {} if self.entries is None else {"entries": identify_entries(self.entries)}
-        return identity | ({"goals": goal_entries} if goal_entries else {}) | entering
 
 
 def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> list[Path]:
@@ -80,6 +43,7 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
     """
     check_length(simulation.policy, simulation.num_steps)
     if simulation.entries is not None:
+        load_entries(simulation.entries)
         check_decisions(simulation.policy.steps_per_decision)
     check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
     identity = simulation.describe()

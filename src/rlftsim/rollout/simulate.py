@@ -87,7 +87,6 @@ def simulate(
         raise ConfigError(
             f"goals are due after {FUTURE_STEPS} steps, not after {num_steps}: simulate 8 seconds, or leave goals out."
         )
-    num_decisions = num_steps // stride
     world = None if entries is None else OpenWorld(batch, rollout_ids, seed, stride, entries)
     force = force if world is None else world.force
     goals = goals and goals.repeat(len(rollout_ids))
@@ -117,27 +116,40 @@ def simulate(
         if observe is not None:
             observe(torch.cat(poses, dim=3))
 
-    # 3. one value. A decision counts unless the agent is padding, decides nothing any more or was forced through all of
-    #    the decision's steps
-    path = torch.cat(poses, dim=3)  # [B, N, A, T, 3]
-    all_forced = _join_states(forced_states, path)
-    present = batch.agent_mask[:, None].expand(path.shape[:3])  # [B, N, A]
-    mask = torch.stack([present if decides is None else present & decides for decides in masks], 3)  # [B, N, A, L]
-    if all_forced is not None:
-        mask = mask & ~all_forced.valid.unflatten(-1, (num_decisions, -1)).all(-1)
-    log_prob = torch.where(mask, torch.stack(log_probs, dim=3), 0.0)
-    is_nan = log_prob.isnan().flatten(1).any(1)  # [B]
+    # 3. one value
+    valid = None if world is None else world.valid.to(batch.device)
+    rollouts = _join_decisions(batch, poses, decisions, log_probs, forced_states, masks)
+    rollouts = replace(rollouts, draws=draws, goals=goals, valid=valid)
+    is_nan = rollouts.log_prob.isnan().flatten(1).any(1)  # [B]
     if not may_be_nan and is_nan.any():
         first = batch.scenarios[int(is_nan.nonzero()[0])].scenario_id
         raise DataError(
             f"{type(policy).__name__} decides with probabilities that are NaN in scenario {first}: load its weights "
             "again if they diverged, or leave out a scenario with extreme values."
         )
-    decision = torch.stack(decisions, dim=3)
-    valid = None if world is None else world.valid.to(batch.device)
-    return Rollouts(
-        path[..., :2], path[..., 2], decision, mask, log_prob, draws=draws, goals=goals, forced=all_forced, valid=valid
-    )
+    return rollouts
+
+
+def _join_decisions(
+    batch: ScenarioBatch,
+    poses: list[Tensor],
+    decisions: list[Tensor],
+    log_probs: list[Tensor],
+    forced: list[AgentStates | None],
+    masks: list[Tensor | None],
+) -> Rollouts:
+    """Rollouts of the decisions of all steps, a list each.
+
+    A decision counts unless the agent is padding, decides nothing any more or was forced through all of its steps.
+    """
+    path = torch.cat(poses, dim=3)  # [B, N, A, T, 3]
+    all_forced = _join_states(forced, path)
+    present = batch.agent_mask[:, None].expand(path.shape[:3])  # [B, N, A]
+    mask = torch.stack([present if decides is None else present & decides for decides in masks], 3)  # [B, N, A, L]
+    if all_forced is not None:
+        mask = mask & ~all_forced.valid.unflatten(-1, (len(masks), -1)).all(-1)
+    log_prob = torch.where(mask, torch.stack(log_probs, dim=3), 0.0)
+    return Rollouts(path[..., :2], path[..., 2], torch.stack(decisions, dim=3), mask, log_prob, forced=all_forced)
 
 
 def _changes_lights(batch: ScenarioBatch, step: int) -> bool:

@@ -180,18 +180,34 @@ def read_result(result: Any, result_type: Any) -> Any:
     return result
 
 
-def to_batch(scenarios: Any, device: torch.device | str = "cpu") -> ScenarioBatch:
+def to_dataset(scenarios: Any, split: str | None) -> ScenarioDataset | None:
+    """An opened data set as it is, or the data set of a name; None for scenarios in any other form.
+
+    Args:
+        scenarios: Scenarios in any form that public functions take.
+        split: Split of a data set that is opened by its name; None = all.
+
+    Raises:
+        DataError: No data set of this name, or none of its scenarios is in the split.
+    """
+    if isinstance(scenarios, str | os.PathLike):
+        return open_dataset(scenarios, split)
+    return scenarios if isinstance(scenarios, ScenarioDataset) else None
+
+
+def to_batch(scenarios: Any, device: torch.device | str = "cpu", split: str | None = "validation") -> ScenarioBatch:
     """Batch of scenarios; a batch stays as it is but for the device.
 
     Args:
         scenarios: Scenarios in any form that public functions take.
         device: Device of the batch's tensors.
+        split: Split of a data set that is named; None = all.
 
     Raises:
         ConfigError: No scenario, or something else was handed over.
         DataError: No data set of this name, or an unsound scenario.
     """
-    loaded = to_scenarios(scenarios)
+    loaded = to_scenarios(scenarios, split)
     if not isinstance(scenarios, ScenarioBatch):
         scenarios = collate([loaded[position] for position in range(len(loaded))])
     return scenarios.to(device)

@@ -8,9 +8,9 @@ from typing import Literal, overload
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.explain_page import explain_rollouts
-from rlftsim.evaluation.in_memory import score_in_memory
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
+from rlftsim.evaluation.score_in_memory import score_in_memory
 from rlftsim.jobs.progress import print_line, print_lines, print_wide
 from rlftsim.jobs.runner import Unfinished, Work
 from rlftsim.realism import RealismResult
