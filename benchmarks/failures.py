@@ -101,16 +101,16 @@ def compare_with_brute_force(out: Path, quick: bool) -> None:
     )
 
 
-def measure_tuning(out: Path, data: list[str], budget: str, jobs: int, quick: bool) -> None:
+def measure_tuning(out: Path, data: list[str], budget: str, jobs: int, limit: int | None) -> None:
     """Table: failures of each planner per 1 000 km in both kinds of traffic."""
     lines = []
     for folder in data:
         for planner in PLANNERS:
             for model in ("demo-base", "demo-tuned"):
-                config = StudyConfig(planner, folder, model=model, limit=2 if quick else None)
+                config = StudyConfig(planner, folder, model=model, limit=limit)
                 name = f"{Path(folder).name}-{planner}-{model}"
                 study: Study = run_study(
-                    config, out / name, parse_budget("60s" if quick else budget), lambda n: choose_runner(jobs, n)
+                    config, out / name, parse_budget(budget), lambda n: choose_runner(jobs, n)
                 )
                 lines.append(f"| {Path(folder).name} | {planner} | {model} | {study.describe_total()} |")
                 print(lines[-1], flush=True)
@@ -126,13 +126,15 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--data", nargs="+", default=["synthetic"])
     parser.add_argument("--budget", default="90m", help="of each study of `tuning`, time of one core")
+    parser.add_argument("--limit", type=int, help="scenarios of each study of `tuning`, the first ones; default: all")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     if arguments.part == "brute":
         compare_with_brute_force(arguments.out, arguments.quick)
     else:
-        measure_tuning(arguments.out, arguments.data, arguments.budget, arguments.jobs, arguments.quick)
+        budget, limit = ("60s", 2) if arguments.quick else (arguments.budget, arguments.limit)
+        measure_tuning(arguments.out, arguments.data, budget, arguments.jobs, limit)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "rlftsim"
 BENCHMARK = ROOT / "benchmarks" / "mutants.py"
-MUTANTS = 2
+MUTANTS = 1
 """Of each family; the hostile inputs come besides."""
 READS = {
     "read_bytes", "read_text", "read_table", "read_schema", "read_metadata", "ParquetFile", "memory_map", "open_file",

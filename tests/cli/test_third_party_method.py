@@ -31,6 +31,8 @@ COMMAND = [
     "synthetic",
     "--split",
     "validation",
+    "--limit",
+    "8",
     "--method",
     "nudge",
 ]
@@ -47,10 +49,10 @@ def package(tmp_path, monkeypatch):
 
 
 def test_a_method_of_another_package_trains_by_its_name_and_its_flags(package, capsys):
-    words = [*COMMAND, "--nudge.batch-size", "80", "--nudge.step", "0.5", "--out"]
+    words = [*COMMAND, "--nudge.batch-size", "16", "--nudge.step", "0.5", "--out"]
     assert main([*words, str(package / "tuned")]) == 0
     stored = json.loads((package / "tuned" / "config.json").read_text())
-    assert (stored["step"], stored["batch_size"]) == (0.5, 80)
+    assert (stored["step"], stored["batch_size"]) == (0.5, 16)
     assert "nudge begins: 1 updates of" in capsys.readouterr().err
     tuned, base = load_policy(str(package / "tuned")).state_dict(), load_policy("demo-base").state_dict()
     assert [name for name in base if not torch.equal(tuned[name], base[name])]
