@@ -9,7 +9,7 @@ Everything that is finished lies in OUT and is not done again.
 
 import argparse
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 
@@ -56,11 +56,25 @@ def split(config: StudyConfig, scenario_id: str, repeat: int) -> dict:
     return asdict(config.chain(scenario_id, repeat).estimate(config.particles, 1)[0])
 
 
-def compare_with_brute_force(out: Path, quick: bool) -> None:
+@dataclass(frozen=True)
+class Comparison:
+    """Size of the comparison with brute force, for each planner."""
+
+    planners: tuple[str, ...] = PLANNERS
+    scenarios: int = 5
+    look: int = 300
+    """Episodes of each scenario that choose."""
+    episodes: int = 5000
+    particles: int = 64
+    repeats: int = 10
+
+
+def compare_with_brute_force(out: Path, size: Comparison) -> None:
     """Table: intervals of brute force and of splitting, and variance × steps of both."""
-    scenarios, look, episodes, particles, repeats = (1, 100, 200, 8, 3) if quick else (5, 300, 5000, 64, 10)
+    scenarios, look, episodes = size.scenarios, size.look, size.episodes
+    particles, repeats = size.particles, size.repeats
     rows, overlaps = [], 0
-    for planner in PLANNERS:
+    for planner in size.planners:
         config, chosen = StudyConfig(planner, particles=particles), []
         for scenario_id in config.scenario_ids():
             # the first look decides which scenarios are driven further, and is not part of the comparison
@@ -78,7 +92,7 @@ def compare_with_brute_force(out: Path, quick: bool) -> None:
             high = stats.beta.ppf(0.975, events + 1, episodes - events)
             results = [
                 load_or_make(
-                    out / "split" / f"{planner}-{scenario_id}-{repeat}.json",
+                    out / f"split-{particles}" / f"{planner}-{scenario_id}-{repeat}.json",
                     partial(split, config, scenario_id, repeat),
                 )
                 for repeat in range(1, repeats + 1)
@@ -109,9 +123,7 @@ def measure_tuning(out: Path, data: list[str], budget: str, jobs: int, limit: in
             for model in ("demo-base", "demo-tuned"):
                 config = StudyConfig(planner, folder, model=model, limit=limit)
                 name = f"{Path(folder).name}-{planner}-{model}"
-                study: Study = run_study(
-                    config, out / name, parse_budget(budget), lambda n: choose_runner(jobs, n)
-                )
+                study: Study = run_study(config, out / name, parse_budget(budget), lambda n: choose_runner(jobs, n))
                 lines.append(f"| {Path(folder).name} | {planner} | {model} | {study.describe_total()} |")
                 print(lines[-1], flush=True)
     write_text(
@@ -129,9 +141,17 @@ def main() -> None:
     parser.add_argument("--limit", type=int, help="scenarios of each study of `tuning`, the first ones; default: all")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--quick", action="store_true")
+    sizes = parser.add_argument_group("size of `brute`")
+    sizes.add_argument("--planners", nargs="+", default=PLANNERS)
+    for field in fields(Comparison)[1:]:
+        sizes.add_argument(f"--{field.name}", type=int, default=field.default)
     arguments = parser.parse_args()
     if arguments.part == "brute":
-        compare_with_brute_force(arguments.out, arguments.quick)
+        numbers = {field.name: getattr(arguments, field.name) for field in fields(Comparison)[1:]}
+        numbers = (
+            {"scenarios": 1, "look": 100, "episodes": 200, "particles": 8, "repeats": 3} if arguments.quick else numbers
+        )
+        compare_with_brute_force(arguments.out, Comparison(tuple(arguments.planners), **numbers))
     else:
         budget, limit = ("60s", 2) if arguments.quick else (arguments.budget, arguments.limit)
         measure_tuning(arguments.out, arguments.data, budget, arguments.jobs, limit)
