@@ -38,6 +38,7 @@ from rlftsim.verbs import (  # noqa: F401 (so that forked commands need not impo
     augment,
     convert,
     evaluate,
+    failures,
     score,
     simulate,
     submit,
@@ -69,6 +70,8 @@ VICTIMS = {
 }
 TIMED = ("submission.report.json", "submission.report.md", "environment.json")
 """Files that hold the duration of the run, or the words of the command."""
+COMMANDS = ["convert", "evaluate", "simulate", "augment", "score --explain", "submit build"]
+"""Those that are killed unless others are named; `failures` has two parts, which shares do one after the other."""
 
 
 def write_sources(folder, num_scenarios):
@@ -134,6 +137,10 @@ def commands(sources, out):
             "submit", "build", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
             "--config", sources / "entry.toml", "--num-shards", "6", "--device", "cpu", "--i-comply",
         ],
+        "failures": [
+            "failures", "constant_velocity", "--data", sources / "set", "--limit", "2", "--particles", "2", "--budget",
+            "8000", "--out", out,
+        ],
     }  # fmt: skip
 
 
@@ -164,7 +171,7 @@ def start_fork_server():
         [
             *(
                 f"rlftsim.verbs.{name}"
-                for name in ("augment", "convert", "evaluate", "score", "simulate", "submit", "synthesize")
+                for name in ("augment", "convert", "evaluate", "failures", "score", "simulate", "submit", "synthesize")
             ),
         ]
     )
@@ -244,7 +251,7 @@ def tree(folder):
 
 def is_done(folder):
     """True if the result is there."""
-    if any((folder / name).exists() for name in ("rollouts.json", "config.json")):
+    if any((folder / name).exists() for name in ("rollouts.json", "config.json", "failures.parquet")):
         return not any(folder.glob(".lock*"))
     return any((folder / name).exists() for name in ("manifest.json", "submission.tar.gz", "constant_velocity.parquet"))
 
@@ -317,7 +324,9 @@ def measure(options):
     start_fork_server()
     rounds = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     for backend in options.backends:
-        chosen = {name: words for name, words in commands(sources, out).items() if name in (options.commands or [name])}
+        chosen = {
+            name: words for name, words in commands(sources, out).items() if name in (options.commands or COMMANDS)
+        }
         for name, words in chosen.items():
             wanted = -(-options.kills // len(chosen))
             own = [one for one in rounds if (one["backend"], one["command"]) == (backend, name)]
@@ -363,7 +372,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kills", type=int, default=100, help="of each back end")
     parser.add_argument("--backends", nargs="+", choices=list(SHARED_WORDS), default=["inline", "processes", "shares"])
-    parser.add_argument("--commands", nargs="+", help="names of the commands; left out, all of them")
+    parser.add_argument("--commands", nargs="+", help="names; left out, all but failures")
     parser.add_argument("--scenarios", type=int, default=24, help="of the data set")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
