@@ -21,6 +21,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import to_scenarios
+from rlftsim.scenario.polylines import arc_length, resample_to
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +95,31 @@ def test_gates_are_where_lanes_cross_the_border():
     assert np.allclose(gates.standing_closing_mps, np.where(ahead, 5.0, -5.0), atol=0.3)
 
 
+def appear(speed, others, velocity, path=((0.0, 0.0), (100.0, 0.0))):
+    """Speed of somebody who appears at the origin and drives east, or along a path."""
+    line = resample_to(np.array(path), int(arc_length(np.array(path))[-1]) + 1)
+    path_m = np.arange(len(line), dtype=float)
+    return find_safe_speed(np.zeros(2), np.array([1.0, 0.0]), speed, np.array(others), np.array(velocity), line, path_m)
+
+
 def test_nobody_appears_where_braking_could_not_avoid_the_one_ahead():
-    east, still = np.array([1.0, 0.0]), np.zeros((1, 2))
-    assert find_safe_speed(np.zeros(2), east, 15.0, np.array([[200.0, 0.0]]), still) == 15.0
-    slowed = find_safe_speed(np.zeros(2), east, 15.0, np.array([[30.0, 0.0]]), still)
-    assert slowed == pytest.approx(np.sqrt(2 * 3 * 24))  # stops 6 m behind, at 3 m/s²
-    assert find_safe_speed(np.zeros(2), east, 15.0, np.array([[4.0, 1.0]]), still) is None
-    assert find_safe_speed(np.zeros(2), east, 2.0, np.array([[-20.0, 0.0]]), np.array([[20.0, 0.0]])) is None
-    assert find_safe_speed(np.zeros(2), east, 15.0, np.array([[4.0, 3.5]]), still) == 15.0  # beside
+    still = [(0.0, 0.0)]
+    assert appear(15.0, [(200.0, 0.0)], still) == 15.0
+    slowed = appear(15.0, [(30.0, 0.0)], still)
+    # half a second on, then braking at 3 m/s², it stops 6 m behind
+    assert 0.5 * slowed + slowed**2 / (2 * 3) == pytest.approx(24.0)
+    assert appear(15.0, [(4.0, 1.0)], still) is None
+    assert appear(2.0, [(-20.0, 0.0)], [(20.0, 0.0)]) is None
+    assert appear(15.0, [(4.0, 3.5)], still) == 15.0  # beside
+
+
+def test_who_appears_sees_the_one_behind_the_bend_and_nobody_who_is_about_to_cross():
+    bend = ((0.0, 0.0), (20.0, 0.0), (20.0, 60.0))
+    assert appear(15.0, [(20.0, 15.0)], [(0.0, 0.0)]) == 15.0
+    slowed = appear(15.0, [(20.0, 15.0)], [(0.0, 0.0)], bend)
+    assert 0.5 * slowed + slowed**2 / (2 * 3) == pytest.approx(35.0 - 6.0)
+    assert appear(10.0, [(15.0, -15.0)], [(0.0, 10.0)]) is None
+    assert appear(10.0, [(15.0, -15.0)], [(0.0, -10.0)]) == 10.0
 
 
 def busy_log():

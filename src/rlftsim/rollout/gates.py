@@ -6,7 +6,7 @@ G gates, P points of lanes.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.polylines import arc_length, resample_to
@@ -24,6 +24,8 @@ UNKNOWN_LIMIT_MPS, CRUISE = 10.0, 0.7
 class Gates:
     """Places where lanes cross the border of the region."""
 
+    point: Int64[np.ndarray, "G"]
+    """Point of the lane, for `GateFinder.follow`."""
     position: Float[np.ndarray, "G 2"]
     heading: Float[np.ndarray, "G"]
     """Direction of the lane."""
@@ -54,6 +56,7 @@ class GateFinder:
     def __init__(self, scenario: Scenario):
         graph = lane_graph(scenario)
         points, headings, speeds, follows = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, bool)]
+        distances = [np.zeros(0)]
         for line, limit in zip(graph.lines, graph.speed_limit_mps):
             count = max(int(np.ceil(arc_length(line)[-1] / SPACING_M)), 1) + 1
             sampled = resample_to(line[:, :2] - scenario.origin, count)
@@ -62,12 +65,15 @@ class GateFinder:
             headings.append(np.arctan2(direction[:, 1], direction[:, 0]))
             speeds.append(np.full(count, CRUISE * (limit or UNKNOWN_LIMIT_MPS)))
             follows.append(np.arange(count) < count - 1)
+            distances.append(arc_length(sampled))
         self.points, self.heading = np.concatenate(points), np.concatenate(headings)
         self.speed, self.is_followed = np.concatenate(speeds), np.concatenate(follows)
         ends = [
             line[-1, :2] - scenario.origin for line, successors in zip(graph.lines, graph.successors) if not successors
         ]
         self.ends = np.array(ends).reshape(-1, 2)
+        self._along_m, self._successors = np.concatenate(distances), graph.successors
+        self._first = np.concatenate([[0], np.cumsum([len(line) for line in points])])[1:]  # of each lane
 
     def find(self, ego: Float[np.ndarray, "2"], ego_velocity: Float[np.ndarray, "2"], region_m: float) -> Gates:
         """Gates of a region.
@@ -84,7 +90,28 @@ class GateFinder:
         heading, speed = self.heading[index], self.speed[index]
         velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
         standing = -(ego_velocity * inward).sum(-1)
-        return Gates(self.points[index], heading, inward, speed, (velocity * inward).sum(-1) + standing, standing)
+        return Gates(
+            index, self.points[index], heading, inward, speed, (velocity * inward).sum(-1) + standing, standing
+        )
+
+    def follow(self, point: int, distance_m: float) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
+        """Points of the lanes ahead on every branch, and distances driven to them.
+
+        Args:
+            point: Point of a lane.
+            distance_m: Length of the way.
+        """
+        pending, points, distances = [(point, 0.0)], [], []
+        while pending:
+            start, driven_m = pending.pop()
+            lane = int(np.searchsorted(self._first, start, "right")) - 1
+            ahead = slice(start, int(self._first[lane + 1]))
+            along_m = driven_m + self._along_m[ahead] - self._along_m[start]
+            points.append(self.points[ahead][along_m <= distance_m])
+            distances.append(along_m[along_m <= distance_m])
+            if along_m[-1] < distance_m:
+                pending += [(int(self._first[lane]), float(along_m[-1])) for lane in self._successors[lane]]
+        return np.concatenate(points), np.concatenate(distances)
 
 
 def find_region_m(scenario: Scenario) -> float:

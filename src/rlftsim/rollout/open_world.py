@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
-from rlftsim.rollout.entries import EntryModel
-from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, find_region_m
+from rlftsim.rollout.entries import Entrants, EntryModel
+from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, Gates, find_region_m
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch
@@ -40,8 +40,16 @@ STANDSTILL_GAP_M, BESIDE_M, ANYWHERE_M = 6.0, 2.3, 3.0
 """Least distance of centers along and across the way and in any direction; the first is left after braking, too."""
 PARKED_M, PARKED_MPS = 1.8, 0.3
 """A vehicle that enters so far beside the lane's center and so slowly is parked, and stays."""
+OFF_LANES_M, ROADSIDE_M = 2.4, 2.8
+"""Least distance of parked vehicles from the center of every lane, so that cars pass, and the usual one."""
+MOST_TURNED_AWAY = 5
+"""Agents that found no room, and for whom others may enter half a second later."""
+CROSSING_S = 2.0
+"""Nobody appears whom another agent would meet within this time if both went straight on."""
 LANE_HALF_WIDTH_M = 1.8
 LOOK_M = 80.0
+STRAIGHT_M = np.arange(0.0, LOOK_M, 2.0)
+"""Points of the way of those that follow no lane."""
 
 
 def add_visitors(scenario: Scenario) -> Scenario:
@@ -125,6 +133,7 @@ class OpenWorld:
         self.waiting = np.zeros((shape[1], 3))
         self.waiting[:, 0] = WAITING_M + WAITING_GAP_M * (np.arange(shape[1]) - first_visitor)
         self.waiting[:, 1] = WAITING_M
+        self._turned_away = [0] * len(rollout_ids)
         self._valid: list[Bool[np.ndarray, "N A"]] = []
 
     @property
@@ -149,8 +158,8 @@ class OpenWorld:
         self.is_parked &= self.present
         imposed = ~self.present | self.is_parked
         forced[self.is_parked] = pose[self.is_parked][:, None]
-        for n, rng in enumerate(self.rngs):
-            for agent, path, is_parked in self._enter(pose[n], velocity[n], self.present[n], is_free[n], rng):
+        for n in range(len(self.rngs)):
+            for agent, path, is_parked in self._enter(n, pose[n], velocity[n], is_free[n]):
                 forced[n, agent], imposed[n, agent] = path, True
                 self.present[n, agent], self.is_parked[n, agent] = True, is_parked
         self._valid.append(self.present.copy())
@@ -168,33 +177,59 @@ class OpenWorld:
         self.present &= ~away
 
     def _enter(
-        self, pose: Float[np.ndarray, "A 3"], velocity: Float[np.ndarray, "A 2"], present: Bool[np.ndarray, "A"],
-        is_free: Bool[np.ndarray, "A"], rng: np.random.Generator,
+        self, n: int, pose: Float[np.ndarray, "A 3"], velocity: Float[np.ndarray, "A 2"], is_free: Bool[np.ndarray, "A"]
     ) -> list[tuple[int, Float[np.ndarray, "5 3"], bool]]:  # fmt: skip
         """Row and poses of each agent that enters a rollout, and True for vehicles parked beside the lane."""
-        gates = self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m)
-        gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-self.entries.expect(gates))))
+        gates, rng, present = (
+            self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m),
+            self.rngs[n],
+            self.present[n],
+        )
+        rate = self.entries.expect(gates)
+        rate = rate * (1 + self._turned_away[n] / max(rate.sum(), 1e-6))
+        gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-rate)))
         entrants = self.entries.draw(gates, rng)
         free = {int(name): np.flatnonzero(is_free & (self.object_type == name)).tolist() for name in VISITORS}
         others, others_velocity = pose[present, :2], velocity[present]
         entered = []
         for k in range(len(gates)):
-            heading = gates.heading[k] + entrants.turn_rad[k]
-            normal = np.array([-np.sin(gates.heading[k]), np.cos(gates.heading[k])])
-            position, along = (
-                gates.position[k] + entrants.left_m[k] * normal,
-                np.array([np.cos(heading), np.sin(heading)]),
-            )
-            speed = find_safe_speed(position, along, float(entrants.speed_mps[k]), others, others_velocity)
+            place = self._find_place(gates, entrants, k)
+            if place is None:
+                continue
+            position, heading, is_parked = place
+            along, wanted_mps = np.array([np.cos(heading), np.sin(heading)]), float(entrants.speed_mps[k])
+            way = position + STRAIGHT_M[:, None] * along, STRAIGHT_M
+            if entrants.object_type[k] == ObjectType.VEHICLE and not is_parked:
+                way = self.finder.follow(int(gates.point[k]), LOOK_M)
+            speed = find_safe_speed(position, along, wanted_mps, others, others_velocity, *way)
             rows = free.get(int(entrants.object_type[k]), [])
             if speed is None or not rows or np.linalg.norm(position - pose[self.ego, :2]) < EGO_GAP_M:
                 continue
             times = STEP_S * np.arange(1, DECISION_STEPS + 1)[:, None]
             path = np.concatenate([position + times * speed * along, np.full((DECISION_STEPS, 1), heading)], -1)
-            is_vehicle, is_beside = entrants.object_type[k] == ObjectType.VEHICLE, abs(entrants.left_m[k]) > PARKED_M
-            entered.append((rows.pop(), path, bool(is_vehicle and is_beside and speed < PARKED_MPS)))
+            entered.append((rows.pop(), path, is_parked))
             others, others_velocity = np.vstack([others, position]), np.vstack([others_velocity, speed * along])
+        self._turned_away[n] = min(len(gates) - len(entered), MOST_TURNED_AWAY)
         return entered
+
+    def _find_place(
+        self, gates: Gates, entrants: Entrants, k: int
+    ) -> tuple[Float[np.ndarray, "2"], float, bool] | None:
+        """Position and heading of an entrant, and True for one that is parked; None where it would block a lane."""
+        lane, left, turn = gates.position[k], float(entrants.left_m[k]), float(entrants.turn_rad[k])
+        side = np.array([-np.sin(gates.heading[k]), np.cos(gates.heading[k])])
+        is_vehicle = entrants.object_type[k] == ObjectType.VEHICLE
+        if is_vehicle and (abs(left) <= PARKED_M or entrants.speed_mps[k] >= PARKED_MPS):
+            return lane, float(gates.heading[k]), False
+        # a place to park may be on a lane of this road, then it is the side of the gate's lane
+        for offset in (left, -ROADSIDE_M) if is_vehicle else ():
+            if not self._is_on_lane(lane + offset * side):
+                return lane + offset * side, float(gates.heading[k]) + turn, True
+        return None if is_vehicle else (lane + left * side, float(gates.heading[k]) + turn, False)
+
+    def _is_on_lane(self, position: Float[np.ndarray, "2"]) -> bool:
+        """True where cars would not pass a parked one."""
+        return bool((np.linalg.norm(self.finder.points - position, axis=-1) < OFF_LANES_M).any())
 
 
 def find_safe_speed(
@@ -203,6 +238,8 @@ def find_safe_speed(
     speed_mps: float,
     others: Float[np.ndarray, "k 2"],
     velocity: Float[np.ndarray, "k 2"],
+    path: Float[np.ndarray, "p 2"],
+    path_m: Float[np.ndarray, "p"],
 ) -> float | None:
     """Speed to appear at: the wanted one, or less where braking at 3 m/s² could not avoid the agent ahead.
 
@@ -214,16 +251,25 @@ def find_safe_speed(
         speed_mps: Wanted speed.
         others: Positions of the agents that are there.
         velocity: Velocities of these, m/s.
+        path: Points of the way ahead, with all branches.
+        path_m: Distances along the way to these points.
     """
     offset = others - position
     ahead, left = offset @ along, offset @ np.array([-along[1], along[0]])
     is_beside = (np.abs(ahead) < STANDSTILL_GAP_M) & (np.abs(left) < BESIDE_M)
     if is_beside.any() or (np.linalg.norm(offset, axis=-1) < ANYWHERE_M).any():
         return None
-    in_lane = (np.abs(left) < LANE_HALF_WIDTH_M) & (np.abs(ahead) < LOOK_M)
     pace = np.maximum(velocity @ along, 0.0)
-    room = 2 * BRAKING_MPS2 * np.maximum(np.abs(ahead) - STANDSTILL_GAP_M, 0.0)  # v² that braking takes away
-    leads = in_lane & (ahead > 0)
-    speed = min(speed_mps, float(np.sqrt((pace**2 + room)[leads].min(initial=np.inf))))
-    follows = in_lane & (ahead <= 0)
+    before = BRAKING_MPS2 * STEP_S * DECISION_STEPS  # who appears decides half a second later
+    to_path = np.linalg.norm(others[:, None] - path, axis=-1)  # [k, p]
+    leads, gap_m = to_path.min(-1) < BESIDE_M, path_m[to_path.argmin(-1)]
+    room = 2 * BRAKING_MPS2 * np.maximum(gap_m - STANDSTILL_GAP_M, 0.0)  # v² that braking takes away
+    speed = min(speed_mps, float(np.sqrt((pace**2 + room)[leads].min(initial=np.inf) + before**2)) - before)
+    closing = velocity - speed * along
+    time_s = -(offset * closing).sum(-1) / np.maximum((closing * closing).sum(-1), 1e-6)
+    nearest = np.linalg.norm(offset + np.clip(time_s, 0.0, CROSSING_S)[:, None] * closing, axis=-1)
+    if (nearest < ANYWHERE_M)[~leads].any():
+        return None
+    follows = (np.abs(left) < LANE_HALF_WIDTH_M) & (ahead <= 0) & (ahead > -LOOK_M)
+    room = 2 * BRAKING_MPS2 * np.maximum(-ahead - STANDSTILL_GAP_M, 0.0)
     return None if (pace**2 - room > speed**2)[follows].any() else speed
