@@ -3,6 +3,7 @@
 import copy
 import inspect
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
@@ -96,6 +97,21 @@ def test_values_of_features_stay_within_their_bounds(base):
         values = feature(dist._candidates)
         assert feature.low <= values.min()
         assert values.max() <= feature.high
+
+
+def test_where_nobody_has_a_choice_nothing_is_tilted(base):
+    dist = distribution_of(CalibratedPolicy(base, NAMES, ETA), SCENES[0])
+    certain = replace(dist.base, logits=20 * torch.nn.functional.one_hot(dist.logits.argmax(-1), 48).float())
+    tilted = replace(dist, base=certain)
+    assert torch.equal(tilted.logits, certain.logits)
+    assert tilted.values.shape == (0, len(NAMES))
+
+
+def test_a_scene_without_any_map_has_no_edge_and_no_lane(base):
+    candidates = distribution_of(CalibratedPolicy(base, NAMES), scenes.without_map())._candidates
+    assert len(candidates.row)
+    for values in (candidates.road_edge(0.5), candidates.lane_turn, candidates.lane_offset):
+        assert not values.any()
 
 
 def test_other_processes_have_the_same_policy(calibrated):

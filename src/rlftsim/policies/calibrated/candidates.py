@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
+from torch.nn import functional
 
 from rlftsim.geometry import heading_vector, rotate, wrap_angle
 from rlftsim.rollout.types import FARTHEST_STEP_M
@@ -38,6 +39,8 @@ SUPPORT_NATS = 9.2
 """Log of the ratio between the likeliest token and the least likely candidate: 10,000."""
 FADE_NATS = 2.3
 """Distance above the limit over which the features of candidates fade in."""
+FAR_M = 1e6
+"""Where padding lies, in both coordinates."""
 MOVING_MPS = 0.5
 MAX_NEIGHBORS = 6
 """Nearest agents that overlaps are looked for with."""
@@ -53,67 +56,70 @@ NO_GAP_M = 200.0
 """Gap of an agent without a leader."""
 
 
-@dataclass(frozen=True, eq=False)
 class Segments:
-    """Straight segments of a scene's lanes, or of the road edges, which have the road on the left."""
+    """Straight segments of the lanes, or of the road edges, of several scenarios; edges have the road on the left.
 
-    start: Float[Tensor, "S 2"]
-    delta: Float[Tensor, "S 2"]
+    Args:
+        maps: Start and vector [s, 2, 2] of the segments of each scenario.
+    """
 
-    def to(self, device: torch.device | str) -> "Segments":
-        """Copy on a device."""
-        return Segments(self.start.to(device), self.delta.to(device))
+    def __init__(self, maps: Sequence[Float[Tensor, "_ 2 2"]]):
+        # padding lies far from any agent; among less than 64 k values topk would look three times as long for k
+        length = max(64 * NUM_CANDIDATES, *map(len, maps))
+        padding = maps[0].new_tensor([[FAR_M, FAR_M], [1.0, 0.0]])
+        padded = torch.stack([torch.cat([part, padding.expand(length - len(part), 2, 2)]) for part in maps])
+        start, delta = padded.unbind(2)  # [B, S, 2]
+        center, direction = start + delta / 2, delta / delta.norm(dim=-1, keepdim=True)
+        self._centers, self._poses = center, torch.cat([center, METERS_PER_TURN * direction], -1)
+        self._table = torch.cat([start, delta, direction], -1).flatten(0, 1)
 
     def find_nearest(
-        self, position: Float[Tensor, "R 2"], heading: Float[Tensor, "R"] | None = None
+        self, scenario: Int64[Tensor, "R"], position: Float[Tensor, "R 2"], heading: Float[Tensor, "R"] | None = None
     ) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
         """Vectors to the nearest segments, and along these.
 
         Args:
+            scenario: Scenario of each position, in increasing order.
             position: Positions to look from, map frame, meters.
             heading: Headings at the positions, so that segments of different direction count as farther away; None =
                 any direction.
 
         Returns:
-            Vector from each position to the nearest point of the segment, and the segment's direction, a unit vector.
+            Vector from each position to the nearest point of the segment, of at least 100 km where there are no
+            segments, and the segment's direction, a unit vector.
         """
         # 1. a few segments whose centers are nearest: the squared distance without the term that all share
         keys, queries = self._centers, position
         if heading is not None:
-            keys = torch.cat([keys, METERS_PER_TURN * self._directions], -1)
-            queries = torch.cat([queries, METERS_PER_TURN * heading_vector(heading)], -1)
-        gaps = torch.addmm(keys.square().sum(-1) / 2, queries, keys.mT, alpha=-1)  # [R, S]
-        index = gaps.topk(min(NUM_CANDIDATES, len(keys)), largest=False, sorted=False).indices.sort(-1).values
+            keys, queries = self._poses, torch.cat([queries, METERS_PER_TURN * heading_vector(heading)], -1)
+        half_squares, num_rows = keys.square().sum(-1) / 2, torch.bincount(scenario, minlength=len(keys)).tolist()
+        indices = []
+        for half_square, of_map, rows in zip(half_squares, keys, queries.split(num_rows)):
+            gaps = torch.addmm(half_square, rows, of_map.mT, alpha=-1)  # [r, S]
+            indices.append(gaps.topk(NUM_CANDIDATES, largest=False, sorted=False).indices)
+        index = torch.cat(indices).sort(-1).values + (scenario * keys.shape[1])[:, None]  # [R, 4]
         # 2. the nearest of these; of two that are equally near, to the millimeter, always the first
-        start, delta = self.start[index], self.delta[index]  # [R, 4, 2]
+        start, delta, direction = functional.embedding(index, self._table).split(2, -1)  # [R, 4, 2]
         fraction = ((position[:, None] - start) * delta).sum(-1) / delta.square().sum(-1)
         offset = start + fraction.clamp(0.0, 1.0)[..., None] * delta - position[:, None]
         distance = offset.square().sum(-1)
         if heading is not None:
-            turned = self._directions[index] - heading_vector(heading)[:, None]
+            turned = direction - heading_vector(heading)[:, None]
             distance = distance + METERS_PER_TURN**2 * turned.square().sum(-1)
-        nearest = (1e3 * distance.sqrt()).round().argmin(-1, keepdim=True)[..., None].expand(-1, -1, 2)
-        return offset.gather(1, nearest)[:, 0], self._directions[index].gather(1, nearest)[:, 0]
-
-    @cached_property
-    def _centers(self) -> Float[Tensor, "S 2"]:
-        return self.start + self.delta / 2
-
-    @cached_property
-    def _directions(self) -> Float[Tensor, "S 2"]:
-        return self.delta / self.delta.norm(dim=-1, keepdim=True)
+        nearest = (1e3 * distance.sqrt()).round().argmin(-1)[:, None, None].expand(-1, -1, 2)
+        return offset.gather(1, nearest)[:, 0], direction.gather(1, nearest)[:, 0]
 
 
 @cached_on_scenario
-def cut_segments(scenario: Scenario, types: tuple[int, ...], frame: Frame) -> Segments | None:
-    """Segments of a scenario's map features; None where there are none.
+def cut_segments(scenario: Scenario, types: tuple[int, ...], frame: Frame) -> Float[Tensor, "s 2 2"]:
+    """Start and vector of each segment of a scenario's map features; none where there are no such features.
 
     Args:
         scenario: Scenario with the map to cut, in the world frame.
         types: `MapFeatureType` numbers of the features to cut.
         frame: Frame of the segments, "map" or "world".
     """
-    features, starts, deltas = scenario.map_features, [], []
+    features, segments = scenario.map_features, [np.empty((0, 2, 2))]
     for index in features.find_indices(types):
         line = features.polyline(index)[:, :2].astype(np.float64) - compute_origin(scenario, frame)
         length = arc_length(line)[-1] if len(line) > 1 else 0.0
@@ -122,11 +128,8 @@ def cut_segments(scenario: Scenario, types: tuple[int, ...], frame: Frame) -> Se
             points = resample_to(line, int(np.ceil(length / SEGMENT_LENGTH_M - 1e-3)) + 1)
             steps = np.diff(points, axis=0)
             has_length = np.linalg.norm(steps, axis=1) > 0
-            starts.append(points[:-1][has_length])
-            deltas.append(steps[has_length])
-    if not sum(map(len, starts)):
-        return None
-    return Segments(*(torch.from_numpy(np.concatenate(v).astype(np.float32)) for v in (starts, deltas)))
+            segments.append(np.stack([points[:-1], steps], 1)[has_length])
+    return torch.from_numpy(np.concatenate(segments).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +178,8 @@ class Scene:
     size: Float[Tensor, "B A 2"]
     """Length and width."""
     agent_mask: Bool[Tensor, "B A"]
-    lanes: tuple[Segments | None, ...]
-    """Lanes of each scenario; None = a map without lanes."""
-    edges: tuple[Segments | None, ...]
+    lanes: Segments
+    edges: Segments
 
     def begin(self, num_rollouts: int) -> Traffic:
         """The current step, N times; no copies."""
@@ -194,9 +196,8 @@ def build_scene(batch: ScenarioBatch) -> Scene:
     position, heading, velocity = (values[:, None, :, CURRENT_STEP, None] for values in logged)  # [B, 1, A, 1, ...]
     speed = (velocity * heading_vector(heading)).sum(-1)
 
-    def cut(types: tuple[int, ...]) -> tuple[Segments | None, ...]:
-        maps = (cut_segments(scenario, types, batch.frame) for scenario in batch.scenarios)
-        return tuple(segments and segments.to(batch.device) for segments in maps)
+    def cut(types: tuple[int, ...]) -> Segments:
+        return Segments([cut_segments(scenario, types, batch.frame).to(batch.device) for scenario in batch.scenarios])
 
     return Scene(
         current=Traffic(position, heading, velocity, speed, torch.zeros_like(heading)),
@@ -218,7 +219,7 @@ class _Neighbors:
     """Heading minus that of the agent."""
     half_size: Float[Tensor, "R O 2"]
     reach: Float[Tensor, "R O"]
-    """Distance of the centers at which an overlap becomes possible; minus infinity for agents too far away."""
+    """Distance of the centers at which an overlap becomes possible; 0 for agents too far away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,6 +260,11 @@ class Candidates:
     def is_vehicle(self) -> Bool[Tensor, "R"]:
         """True for vehicles, False for pedestrians and cyclists."""
         return self.scene.class_id[self.agent_index[0], self.agent_index[2]] == 0
+
+    @cached_property
+    def of_vehicles(self) -> Float[Tensor, "P"]:
+        """1 for the pairs of vehicles, 0 for those of pedestrians and cyclists."""
+        return self.where(self.is_vehicle)
 
     @cached_property
     def is_moving(self) -> Bool[Tensor, "R"]:
@@ -313,16 +319,19 @@ class Candidates:
         neighbors = self._neighbors
         position = neighbors.position + neighbors.velocity * seconds  # [R, O, 2]
         scale = seconds / self.seconds  # of the token's motion, which goes on along the same line
-        # 1. pairs whose token can get near a neighbor, [Q]: first by the longest of the agent's tokens
-        is_reachable = position.norm(dim=-1) < neighbors.reach + self._max_length[:, None] * scale
-        pair, neighbor = self.of_pairs(is_reachable).nonzero(as_tuple=True)
-        row = self.row.index_select(0, pair)
-        neighbor += row * is_reachable.shape[1]  # among the R x O
+        # 1. pairs whose token gets near a neighbor, [Q]: first by the rectangle around the ends of the agent's tokens
+        low, high = (bound[:, None] * scale for bound in self._bounds)
+        row, neighbor = _is_near(position - position.clamp(low, high), neighbors.reach).nonzero(as_tuple=True)  # [E]
+        count = self._counts.index_select(0, row)
+        first = (self._counts.cumsum(0) - self._counts).index_select(0, row)  # pair of the agent
+        edge = torch.repeat_interleave(count)
+        pair = torch.arange(len(edge), device=edge.device) + (first - count.cumsum(0) + count).index_select(0, edge)
+        row, neighbor = row.index_select(0, edge), (row * position.shape[1] + neighbor).index_select(0, edge)
         end = self.end.index_select(0, pair) * scale
         offset = position.flatten(0, 1).index_select(0, neighbor) - end[:, :2]
-        x, y = offset.unbind(-1)
-        touches = x.square() + y.square() < neighbors.reach.flatten().index_select(0, neighbor).square()
-        pair, neighbor, row, offset, end = (values[touches] for values in (pair, neighbor, row, offset, end))
+        touches = _is_near(offset, neighbors.reach.flatten().index_select(0, neighbor)).nonzero()[:, 0]
+        values = (pair, neighbor, row, offset, end)
+        pair, neighbor, row, offset, end = (value.index_select(0, touches) for value in values)
         # 2. separation along and across the token's heading, of the boxes that enclose the neighbors there
         heading = end[:, 2]
         longitudinal, lateral = rotate(offset, -heading).abs().unbind(-1)
@@ -362,14 +371,21 @@ class Candidates:
         steps = seconds / self.seconds
         turn = self.traffic.turn[self.agent_index] * steps / 2  # of the chord: [R]
         ahead = rotate(heading_vector(turn), self._heading)
-        points = self.traffic.position[self.agent_index] + ahead * (self.speed * seconds)[:, None]
-        to_edge, _, sign = self._find_nearest(self.scene.edges, points, torch.ones_like(self.is_moving))
+        points = self._position + ahead * (self.speed * seconds)[:, None]
+        to_edge, direction = self.scene.edges.find_nearest(self.agent_index[0], points)
         distance = to_edge.norm(dim=-1)
+        # left of an edge, on the road, the vector to the edge points to the right
+        sign = torch.where(direction[:, 1] * to_edge[:, 0] - direction[:, 0] * to_edge[:, 1] > 0, 1.0, -1.0)
         inside = sign * distance - self._size[:, 1] / 2
         # how far the edge lies to the left of the way, over its distance, and how far the token leads to the left
         edge_left = sign * (ahead[:, 0] * to_edge[:, 1] - ahead[:, 1] * to_edge[:, 0]) / distance.clamp(min=1e-3)
-        left = rotate(self.end[:, :2] * steps, self.end[:, 2] * (steps - 1) / 2 - self.of_pairs(turn))[:, 1]
+        angle = self.end[:, 2] * (steps - 1) / 2 - self.of_pairs(turn)
+        left = angle.sin() * (self.end[:, 0] * steps) + angle.cos() * (self.end[:, 1] * steps)
         return torch.where(distance < EDGE_REACH_M, inside, torch.inf), left * self.of_pairs(edge_left)
+
+    @cached_property
+    def _position(self) -> Float[Tensor, "R 2"]:
+        return self.traffic.position[self.agent_index]
 
     @cached_property
     def _heading(self) -> Float[Tensor, "R"]:
@@ -383,7 +399,10 @@ class Candidates:
     def _relative(self) -> Float[Tensor, "R A 2"]:
         """Positions of all agents of the scene in the agent's frame."""
         b, n, _, moment = self.agent_index
-        offset = self.traffic.position[b, n, :, moment] - self.traffic.position[self.agent_index][:, None]
+        _, num_rollouts, _, num_moments, _ = self.traffic.position.shape
+        of_all = self.traffic.position.transpose(2, 3).flatten(0, 2)  # [B N L, A, 2], in simulations a view
+        of_all = of_all.index_select(0, (b * num_rollouts + n) * num_moments + moment)
+        offset = of_all - self._position[:, None]
         return rotate(offset, -self._heading[:, None])
 
     @cached_property
@@ -394,9 +413,19 @@ class Candidates:
         return is_present & (torch.arange(is_present.shape[1], device=a.device) != a[:, None])
 
     @cached_property
-    def _max_length(self) -> Float[Tensor, "R"]:
-        """Length of the longest candidate token."""
-        return torch.zeros_like(self._heading).scatter_reduce(0, self.row, self.end[:, :2].norm(dim=-1), "amax")
+    def _counts(self) -> Int64[Tensor, "R"]:
+        """Number of each agent's pairs, which follow one another."""
+        return torch.bincount(self.row, minlength=len(self._heading))
+
+    @cached_property
+    def _bounds(self) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
+        """Least and greatest x and y of the ends of each agent's tokens."""
+        ends, row, infinite = (
+            self.end[:, :2],
+            self.row[:, None].expand(-1, 2),
+            torch.full_like(self._position, torch.inf),
+        )
+        return infinite.scatter_reduce(0, row, ends, "amin"), (-infinite).scatter_reduce(0, row, ends, "amax")
 
     @cached_property
     def _neighbors(self) -> "_Neighbors":
@@ -412,34 +441,22 @@ class Candidates:
             velocity=rotate(self.traffic.velocity[neighbor], -self._heading[:, None]),
             turn=self.traffic.heading[neighbor] - self._heading[:, None],
             half_size=half_size,
-            reach=torch.where(squared < NEIGHBOR_REACH_M**2, reach, -torch.inf),
+            reach=torch.where(squared < NEIGHBOR_REACH_M**2, reach, 0.0),
         )
 
     @cached_property
     def _lane(self) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Lateral offset and turn of the nearest lane of moving vehicles."""
-        position = self.traffic.position[self.agent_index]
-        to_lane, direction, _ = self._find_nearest(self.scene.lanes, position, self.is_moving, self._heading)
-        offset = rotate(to_lane, -self._heading)[:, 1].clamp(-5.0, 5.0)
-        turn = wrap_angle(torch.atan2(direction[:, 1], direction[:, 0]) - self._heading).clamp(-1.0, 1.0)
-        has_lane = direction.any(-1)
-        return torch.where(has_lane, offset, 0.0), torch.where(has_lane, turn, 0.0)
+        moving = self.is_moving.nonzero()[:, 0]
+        scenario, heading = self.agent_index[0][moving], self._heading[moving]
+        to_lane, direction = self.scene.lanes.find_nearest(scenario, self._position[moving], heading)
+        offset = rotate(to_lane, -heading)[:, 1].clamp(-5.0, 5.0)
+        turn = wrap_angle(torch.atan2(direction[:, 1], direction[:, 0]) - heading).clamp(-1.0, 1.0)
+        has_lane, nothing = to_lane[:, 0] < FAR_M / 2, torch.zeros_like(self._heading)
+        offset, turn = (torch.where(has_lane, values, 0.0) for values in (offset, turn))
+        return nothing.index_copy(0, moving, offset), nothing.index_copy(0, moving, turn)
 
-    def _find_nearest(
-        self,
-        segments: tuple[Segments | None, ...],
-        points: Float[Tensor, "R 2"],
-        is_selected: Bool[Tensor, "R"],
-        heading: Float[Tensor, "R"] | None = None,
-    ) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"], Float[Tensor, "R"]]:
-        """Vector from a point of each agent to the nearest segment, the segment's direction, and 1 left of the segment,
-        -1 right; a vector of 1 km per axis for agents that are not selected."""
-        offset, direction = torch.full_like(points, 1e3), torch.zeros_like(points)
-        for scenario, scenario_segments in enumerate(segments):
-            rows = (is_selected & (self.agent_index[0] == scenario)).nonzero()[:, 0]
-            if scenario_segments is not None and len(rows):
-                headings = None if heading is None else heading[rows]
-                offset[rows], direction[rows] = scenario_segments.find_nearest(points[rows], headings)
-        # left of a segment, the vector to the segment points to the right
-        side = direction[:, 1] * offset[:, 0] - direction[:, 0] * offset[:, 1]
-        return offset, direction, torch.where(side > 0, 1.0, -1.0)
+
+def _is_near(offset: Float[Tensor, "*shape 2"], reach: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
+    x, y = offset.unbind(-1)
+    return x.square() + y.square() < reach.square()

@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -150,15 +151,15 @@ for _band, _low, _high in (("slow", 0.0, 4.0), ("middle", 4.0, 9.0), ("fast", 9.
 
 for _seconds in (0.5, 1.0):
     register_feature(f"overlap_{_seconds:g}s", low=0.0, high=2.0)(
-        lambda c, seconds=_seconds: c.overlap(seconds) * c.where(c.is_vehicle)
+        lambda c, seconds=_seconds: c.overlap(seconds) * c.of_vehicles
     )
     register_feature(f"overlap_{_seconds:g}s_walking_cycling", low=0.0, high=2.0)(
-        lambda c, seconds=_seconds: c.overlap(seconds) * c.where(~c.is_vehicle)
+        lambda c, seconds=_seconds: c.overlap(seconds) * (1 - c.of_vehicles)
     )
     register_feature(f"edge_{_seconds:g}s", low=0.0, high=3.0)(
-        lambda c, seconds=_seconds: c.road_edge(seconds) * c.where(c.is_vehicle)
+        lambda c, seconds=_seconds: c.road_edge(seconds) * c.of_vehicles
     )
-register_feature("edge_0.5s_walking_cycling", low=0.0, high=3.0)(lambda c: c.road_edge(0.5) * c.where(~c.is_vehicle))
+register_feature("edge_0.5s_walking_cycling", low=0.0, high=3.0)(lambda c: c.road_edge(0.5) * (1 - c.of_vehicles))
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,19 +195,14 @@ class TiltedDistribution(CategoricalDistribution):
         if not self.eta.any():
             return logits
         with torch.autocast(logits.device.type, enabled=False):  # tilts of hundredths count
-            return logits.flatten().index_add(0, self._pairs[2], self.values @ self.eta).view_as(logits)
+            terms = (weight * feature(self._candidates) for weight, feature in zip(self.eta, self.features))
+            tilt = sum(terms, start=self.eta.new_zeros(()))  # no [P, K] in a rollout
+            return logits.flatten().index_add(0, self._pairs[2], self._relate(tilt)).view_as(logits)
 
     @cached_property
     def values(self) -> Float[Tensor, "P K"]:
-        """Features of all candidates, minus those of the agent's likeliest token: what all candidates of an agent share
-        would else lift the tokens that are none."""
-        candidates, (row, _, _) = self._candidates, self._pairs
-        values = torch.stack([feature(candidates) for feature in self.features], -1)
-        # of tokens that are equally likely the first, whatever the device
-        likeliest = (candidates.log_ratio == 0).nonzero()[:, 0]
-        first = likeliest.new_full((self._num_rows,), len(values))
-        first = first.scatter_reduce(0, row[likeliest], likeliest, "amin")  # position among the pairs: [R]
-        return (values - values[first[row]]) * candidates.weight[:, None]
+        """Features of all candidates, as the tilt is made of them: see `_relate`."""
+        return self._relate(torch.stack([feature(self._candidates) for feature in self.features], -1))
 
     def score_function(self, decision: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
         """Gradient of the decisions' log-probability by eta: the features of the chosen token minus the mean of all.
@@ -228,25 +224,52 @@ class TiltedDistribution(CategoricalDistribution):
     def _peak(self) -> Float[Tensor, "R 1"]:
         return self.base.logits.amax(-1, keepdim=True)
 
+    def _relate(self, values: Float[Tensor, "P *more"]) -> Float[Tensor, "P *more"]:
+        """Values minus those of the agent's likeliest token: what all candidates of an agent share would else lift the
+        tokens that are none."""
+        candidates = self._candidates
+        # of tokens that are equally likely the first, whatever the device
+        likeliest = (candidates.log_ratio == 0).nonzero()[:, 0]
+        first = likeliest.new_full((len(self._choices[0]),), len(values))
+        first = first.scatter_reduce(0, candidates.row[likeliest], likeliest, "amin")  # position among the pairs: [R]
+        centered = values - candidates.of_pairs(values.index_select(0, first))
+        return centered * candidates.weight.view(-1, *[1] * (values.dim() - 1))
+
+    @cached_property
+    def _choices(self) -> tuple[Int64[Tensor, "_"], Int64[Tensor, "P"], Int64[Tensor, "P"]]:
+        """Rows with more than a single candidate; of each candidate the position among these rows, and the token."""
+        logits, num_tokens = self.base.logits.detach(), self.base.logits.shape[1]
+        logit_index = _find_greater(logits, self._peak.detach() - SUPPORT_NATS)
+        row = logit_index.div(num_tokens, rounding_mode="floor")
+        has_choice = torch.bincount(row, minlength=self._num_rows) > 1
+        pairs = has_choice.index_select(0, row).nonzero()[:, 0]
+        row, logit_index = row.index_select(0, pairs), logit_index.index_select(0, pairs)
+        index = (has_choice.cumsum(0) - 1).index_select(0, row)
+        return has_choice.nonzero()[:, 0], index, logit_index - row * num_tokens
+
     @cached_property
     def _pairs(self) -> tuple[Int64[Tensor, "P"], Int64[Tensor, "P"], Int64[Tensor, "P"]]:
         """Row and token of each candidate, and the index into the flattened logits; rows with a single candidate have
         none."""
-        num_tokens = self.base.logits.shape[1]
-        logit_index = (self.base.logits > self._peak - SUPPORT_NATS).flatten().nonzero()[:, 0]
-        row = logit_index.div(num_tokens, rounding_mode="floor")
-        has_choice = (torch.bincount(row, minlength=self._num_rows) > 1).index_select(0, row)
-        row, logit_index = row[has_choice], logit_index[has_choice]
-        return row, logit_index - row * num_tokens, logit_index
+        has_choice, index, token = self._choices
+        row = has_choice.index_select(0, index)
+        return row, token, row * self.base.logits.shape[1] + token
 
     @cached_property
     def _candidates(self) -> Candidates:
-        row, token, logit_index = self._pairs
-        has_choice, index = row.unique_consecutive(return_inverse=True)
-        agent = tuple(axis[has_choice] for axis in find_rows(self.mask, is_dense=self._num_rows == self.mask.numel()))
+        (has_choice, index, token), (row, _, logit_index) = self._choices, self._pairs
+        agent = find_rows(self.mask, is_dense=self._num_rows == self.mask.numel())
+        agent = tuple(axis.index_select(0, has_choice) for axis in agent)
         agent = (*agent, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
         class_id = self.scene.class_id[agent[0], agent[2]].index_select(0, index)
         ends = self.vocabulary.poses[:, :, -1]  # [C, V, 3]
         end = ends.flatten(0, 1).index_select(0, class_id * ends.shape[1] + token)
         log_ratio = self.base.logits.flatten().index_select(0, logit_index) - self._peak[:, 0].index_select(0, row)
         return Candidates(self.scene, self.traffic, agent, index, end, log_ratio, self.seconds)
+
+
+def _find_greater(values: Float[Tensor, "R V"], limit: Float[Tensor, "R 1"]) -> Int64[Tensor, "_"]:
+    """Indices of the flattened values that exceed the limit of their row."""
+    if values.device.type != "cpu":
+        return (values > limit).flatten().nonzero()[:, 0]
+    return torch.from_numpy(np.flatnonzero(values.numpy() > limit.numpy()))  # three times as fast as torch
