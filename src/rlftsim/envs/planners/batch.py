@@ -1,7 +1,7 @@
 """Planners that act for the agents of several scenes at once."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class BatchPlanner:
         return self.act_batch(lambda: {name: array[None] for name, array in observation.items()})[0]
 
 
-def acts_in_batches(planner: object) -> bool:
+def acts_in_batches(planner: object) -> TypeGuard[BatchPlanner]:
     """True for a planner with a method `act_batch` that no subclass has replaced by an `act` of its own."""
     definers = (vars(base) for base in type(planner).__mro__)
     return next(("act_batch" in methods for methods in definers if {"act", "act_batch"} & methods.keys()), False)

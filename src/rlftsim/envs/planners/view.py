@@ -102,7 +102,9 @@ def _find_stops(
     waits &= lights[..., 0] >= length[:, None] / 2 - 1.0
     if not waits.any():
         return np.full(len(line), np.inf)
-    lights = lights[:, waits.any(0), :2]
-    distance = np.linalg.norm(line[:, :, None] - lights[:, None], axis=-1)  # [M, P, T]
-    is_on_line = (distance.min(1) <= ON_LINE_M) & waits[:, waits.any(0)]
-    return np.where(is_on_line, distance.argmin(1), np.inf).min(1)
+    agent, light = np.nonzero(waits)
+    x, y = (line[agent, :, axis] - lights[agent, light, axis, None] for axis in range(2))  # [n, P]
+    distance = np.sqrt(x * x + y * y)
+    stop = np.full(waits.shape, np.inf)
+    stop[agent, light] = np.where(distance.min(1) <= ON_LINE_M, distance.argmin(1), np.inf)
+    return stop.min(1)
