@@ -95,12 +95,15 @@ def test_boxes_that_no_proposal_comes_near_change_no_bit(monkeypatch):
     for speed in (0.0, 4.0, 12.0):
         boxes = rng.uniform([-20, -40, -4, -12, -12], [120, 40, 4, 12, 12], (40, 5))
         sizes = rng.uniform([0.6, 0.6], [12.0, 3.0], (40, 2))
-        view = View(speed, np.array([4.6, 1.9]), line, heading, 13.0, boxes, sizes, np.inf, np.zeros((0, 4)))
+        view = View(
+            np.array([speed]), np.array([[4.6, 1.9]]), line[None], heading[None], np.array([13.0]), boxes[None],
+            sizes[None], np.ones((1, 40), bool), np.array([np.inf]), np.zeros((1, 0, 4)),
+        )  # fmt: skip
         is_near = pdm._nears_line(view)
         num_near += is_near.sum()
         proposals = pdm.simulate_proposals(view)
         with monkeypatch.context() as context:
-            context.setattr(pdm, "_nears_line", lambda view: np.ones(len(view.boxes), bool))
+            context.setattr(pdm, "_nears_line", lambda view: view.is_box)
             every_box = pdm.simulate_proposals(view)
         np.testing.assert_array_equal(proposals.motion, every_box.motion)
         np.testing.assert_array_equal(proposals.controls, every_box.controls)
@@ -358,14 +361,14 @@ def test_a_result_that_another_drive_finished_meanwhile_is_not_replaced_by_fewer
 
 def test_unfinished_parts_of_other_settings_outlive_a_repeated_drive(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
-    original, calls = drive_module.drive_scenario, []
+    original, calls = drive_module.drive_scenarios, []
 
     def second_fails(*arguments):
         calls.append(arguments)
         return original(*arguments) if len(calls) == 1 else 1 / 0
 
     with monkeypatch.context() as patch:
-        patch.setattr(drive_module, "drive_scenario", second_fails)
+        patch.setattr(drive_module, "drive_scenarios", second_fails)
         with pytest.raises(ZeroDivisionError):
             drive(replace(config, seed=1), tmp_path)
     parts = [*(tmp_path / "constant_velocity-replay.parts").glob("*.json")]
@@ -659,8 +662,8 @@ def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatc
     (whole,) = drive(config, tmp_path / "whole")
     first, second = whole.table["scenario_id"].to_pylist()
     driven = []
-    original = drive_module.drive_scenario
-    monkeypatch.setattr(drive_module, "drive_scenario", lambda *a: driven.append(a[-1]) or original(*a))
+    original = drive_module.drive_scenarios
+    monkeypatch.setattr(drive_module, "drive_scenarios", lambda *a: driven.extend(a[-1]) or original(*a))
     for number, edit in enumerate((
         lambda row: row,  # as it was: only the other scenario is driven
         lambda row: row.pop("comfort"),

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import cast
@@ -132,7 +132,9 @@ def run_batch(
     Raises:
         EpisodeFailure: SUMO fails, or the planner fails in any scenario.
     """
-    episode, names = source.episode(list(scenarios)), ", ".join(scenario.scenario_id for scenario in scenarios)
+    # scores see at the end who has left the road: no event is asked for
+    episode = replace(source.episode(list(scenarios)), edges=None)
+    names = ", ".join(scenario.scenario_id for scenario in scenarios)
     for rollout in rollouts:
         state = start(episode, (Dice(seed, rollout),) * len(scenarios))
         rows, step = range(len(scenarios)), 0
@@ -156,7 +158,7 @@ def drive_scenarios(
     scenarios = [env.source.scenario(ids[position]) for position in positions]
     rollouts, seed = range(config.num_rollouts), config.seed
     try:
-        if acts_in_batches(planner) and len(scenarios) > 1:
+        if acts_in_batches(planner):
             results = list(run_batch(env.source, planner, scenarios, seed=seed, rollouts=rollouts))
         else:
             results = [

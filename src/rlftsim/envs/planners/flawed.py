@@ -20,7 +20,7 @@ class Timid(IdmPlanner):
     def act_batch(self, observe: Observe) -> Float[np.ndarray, "M 2"]:
         """Actions of the IDM planner for other speed limits."""
         observation = observe()
-        route = observation["route"] * np.float32([1.0, 1.0, self.speed_factor])
+        route = observation["route"] * np.array([1.0, 1.0, self.speed_factor], np.float32)
         return super().act_batch(lambda: {**observation, "route": route})
 
 

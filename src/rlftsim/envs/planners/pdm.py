@@ -41,7 +41,7 @@ SPARSE = 5
 """Every so many steps the drivable area and the time to collision are looked at."""
 LEAST_PROGRESS_M = 0.1
 _NEVER = 1 << 20
-"""Index of no point and no box."""
+"""Index of no point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +103,11 @@ def simulate_proposals(view: View) -> Proposals:
         index = _find_nearest(x, y, motion)
         gap, lead = np.full(shape, np.inf), np.zeros(shape)
         if len(meetings.scene):
-            point, speed_there = meetings.after(step, view)
-            point = point[row, line_row, index]
-            is_led = point < index + LOOKAHEAD_M
-            gap = np.where(is_led, np.maximum(point - index - length / 2, 0.0), gap)
-            lead = np.where(is_led, speed_there[row, line_row, np.where(is_led, point, 0)], lead)
+            first_box, next_point = meetings.after(step, count)
+            point = next_point[row, line_row, index]
+            led = np.nonzero(point < index + LOOKAHEAD_M)
+            gap[led] = np.maximum(point - index - length / 2, 0.0)[led]
+            lead[led] = meetings.speed[first_box[led[0], led[1], point[led]], point[led]]
         to_stop = view.stop_m[:, None, None] - index - length / 2
         to_stop = np.where(to_stop > -1.0, np.maximum(to_stop, 0.0), np.inf)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
@@ -130,8 +130,6 @@ class _Meetings:
 
     scene: Int64[np.ndarray, "N"]
     """Ascending."""
-    first: Int64[np.ndarray, "s"]
-    """Index of the first box of each scene that has boxes."""
     boxes: Float[np.ndarray, "N 5"]
     line_x: Float[np.ndarray, "N l P"]
     line_y: Float[np.ndarray, "N l P"]
@@ -150,29 +148,27 @@ class _Meetings:
             size[:, axis : axis + 1] / 2 + half * np.abs(across(turn)) for axis, across in enumerate((np.sin, np.cos))
         ]
         speed = boxes[:, 3:4] * np.cos(heading) + boxes[:, 4:5] * np.sin(heading)
-        first = np.flatnonzero(np.diff(scene, prepend=-1))
         x, y = np.ascontiguousarray(np.moveaxis(lines[scene], -1, 0))
-        return cls(scene, first, boxes, x, y, np.stack(reach, 1)[:, :, None], np.maximum(speed, 0.0))
+        return cls(scene, boxes, x, y, np.stack(reach, 1)[:, :, None], np.maximum(speed, 0.0))
 
-    def after(self, step: int, view: View) -> tuple[Int64[np.ndarray, "M l P"], Float[np.ndarray, "M l P"]]:
-        """First point, from each point of the lines on, at which a box is met, and the box's speed at each such point.
+    def after(self, step: int, count: int) -> tuple[Int64[np.ndarray, "M l P"], Int64[np.ndarray, "M l P"]]:
+        """Box that is met at each point of the lines, and the first point from there on at which a box is met.
 
         Args:
             step: Step of 0.1 s from the time of planning on, with the boxes at constant velocity.
-            view: View with the lines of the scenes.
+            count: Number M of scenes.
         """
         boxes = _coasted(self.boxes, step * STEP_S)
         x, y = self.line_x - boxes[:, :1, None], self.line_y - boxes[:, 1:2, None]
         forward, lateral = map(np.abs, to_heading_frame(x, y, boxes[:, 2:3, None]))
         meets = (forward <= self.reach[:, 0]) & (lateral <= self.reach[:, 1])  # [N, l, P]
-        # of several boxes at a point the nearest to the agent counts
-        box = np.where(meets, np.arange(len(boxes))[:, None, None], _NEVER)
-        shape = len(view.speed), *box.shape[1:]
-        first_box = np.full(shape, _NEVER)
-        first_box[self.scene[self.first]] = np.minimum.reduceat(box, self.first)
-        point = np.where(first_box < _NEVER, np.arange(shape[2]), _NEVER)
-        point = np.minimum.accumulate(point[..., ::-1], axis=-1)[..., ::-1]
-        return point, self.speed[np.where(first_box < _NEVER, first_box, 0), np.arange(shape[2])]
+        box, line, point = (index[::-1] for index in np.nonzero(meets))
+        shape = count, *meets.shape[1:]
+        first_box, next_point = np.zeros(shape, np.int64), np.full(shape, _NEVER)
+        # of several boxes at a point the nearest to the agent is written last
+        first_box[self.scene[box], line, point] = box
+        next_point[self.scene[box], line, point] = point
+        return first_box, np.minimum.accumulate(next_point[..., ::-1], axis=-1)[..., ::-1]
 
 
 def collisions(view: View, motion: Float[np.ndarray, "M n T1 5"]) -> Bool[np.ndarray, "M n T1"]:
@@ -244,8 +240,12 @@ def _meets(
 def _leaves_road(view: View, motion: Float[np.ndarray, "M n t 5"]) -> Bool[np.ndarray, "M n"]:
     """True where a corner gets 0.3 m or more to the right of the nearest road edge."""
     corners = clockwise_corners(motion[..., :2], motion[..., 2], view.size[:, None, None])  # [M, n, t, 4, 2]
-    distance, side, _ = nearest_edges(corners.reshape(len(motion), -1, 2), view.edges)
-    return ((side < 0) & (distance >= OUTSIDE_M)).reshape(*motion.shape[:2], -1).any(2)
+    corners = corners.reshape(*motion.shape[:2], -1, 2)
+    leaves = np.zeros(motion.shape[:2], bool)
+    for row, edges in enumerate(view.edges):  # the numbers of a scene fit the cache
+        distance, side, _ = nearest_edges(corners[row], edges[None])
+        leaves[row] = np.any((side < 0) & (distance >= OUTSIDE_M), axis=1)
+    return leaves
 
 
 def _nears_line(view: View) -> Bool[np.ndarray, "M K"]:
