@@ -657,6 +657,103 @@ def test_a_cut_result_is_named_in_one_line(result_path, tmp_path, capsys):
     assert line.startswith(f"rlftsim: {cut}: cannot be read (")
 
 
+def drive_idm(**settings):
+    return drive(DriveConfig("idm", **{"traffic": ("replay",), **settings}))[0].table.to_pydict()
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm", "rlftsim.envs.planners.flawed:LateBraker"])
+def test_scenarios_side_by_side_have_the_scores_of_each_alone(name, monkeypatch):
+    config = DriveConfig(name, traffic=("replay", "policy"), limit=3, num_rollouts=2)
+    assert config.count_side_by_side("replay", 3) == 3
+    together = drive(config)
+    monkeypatch.setattr(DriveConfig, "count_side_by_side", lambda *_: 1)
+    for result, alone in zip(together, drive(config)):
+        np.testing.assert_equal(result.table.to_pydict(), alone.table.to_pydict())
+
+
+BATCH_PLANNERS = """
+import numpy as np
+from rlftsim.envs.planners.idm import IdmPlanner
+class Fails(IdmPlanner):
+    fails_in = {id!r}
+    def __init__(self):
+        self.scenarios = []
+    def reset(self, info):
+        self.scenarios.append(info["scenario"])
+    def act_batch(self, observe):
+        action = super().act_batch(observe)
+        if self.fails_in in self.scenarios:
+            raise ValueError("not here")
+        return action
+class NotANumber(Fails):
+    def act_batch(self, observe):
+        action = IdmPlanner.act_batch(self, observe)
+        action[np.array(self.scenarios) == self.fails_in] = np.nan
+        return action
+class Stands(IdmPlanner):
+    def act(self, observation):
+        return np.array([-1.0, 0.0], np.float32)
+"""
+
+
+def test_a_scenario_in_which_the_planner_fails_leaves_the_others_their_scores(tmp_path, monkeypatch):
+    second = open_dataset("synthetic", "validation").scenario_ids[1]
+    (tmp_path / "batches.py").write_text(BATCH_PLANNERS.format(id=second))
+    monkeypatch.syspath_prepend(tmp_path)
+    expected = drive_idm(limit=3)
+    for name, cause in (("Fails", "ValueError: not here"), ("NotANumber", "is nan")):
+        (result,) = drive(DriveConfig(f"batches:{name}", traffic=("replay",), limit=3))
+        assert result.failures.keys() == {second}
+        assert f"planner {name} fails at step 0 of scenario {second}: " in result.failures[second]
+        assert cause in result.failures[second]
+        for column, values in result.table.to_pydict().items():
+            np.testing.assert_equal(values[::2], expected[column][::2])
+    # who defines `act` alone is not driven by the batches of the class above
+    (stands,) = drive(DriveConfig("batches:Stands", traffic=("replay",), limit=2))
+    assert max(stands.values("route_completion")) < min(expected["route_completion"][:2])
+
+
+def test_an_interrupted_drive_side_by_side_does_what_is_missing(tmp_path, monkeypatch):
+    expected = drive_idm(limit=4)
+    original, driven = drive_module.drive_scenarios, []
+
+    def drive_two(*arguments):
+        driven.extend(arguments[-1])
+        return original(*arguments) if arguments[-1][0] == 0 else 1 / 0
+
+    config = DriveConfig("idm", traffic=("replay",), limit=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(DriveConfig, "count_side_by_side", lambda *_: 2)
+        patch.setattr(drive_module, "drive_scenarios", drive_two)
+        with pytest.raises(ZeroDivisionError):
+            drive(config, tmp_path)
+    driven.clear()
+    monkeypatch.setattr(drive_module, "drive_scenarios", lambda *a: driven.extend(a[-1]) or original(*a))
+    (result,) = drive(config, tmp_path)  # four at once, of which two are done
+    assert driven == [2, 3]
+    np.testing.assert_equal(result.table.to_pydict(), expected)
+    assert [path.name for path in tmp_path.iterdir()] == ["idm-replay.parquet"]
+
+
+def test_processes_share_scenarios_that_are_driven_side_by_side():
+    assert DriveConfig("idm", jobs=2).count_side_by_side("replay", 4) == 2
+    np.testing.assert_equal(drive_idm(limit=4, jobs=2), drive_idm(limit=4))
+
+
+def test_a_planner_that_follows_a_plan_asks_for_no_observation():
+    env, planner, seen = EgoEnv(data="synthetic", traffic="replay"), load_planner("pdm"), []
+    observation, info = env.reset(seed=0)
+
+    def observe():
+        seen.append(1)
+        return {name: array[None] for name, array in observation.items()}
+
+    planner.reset(info)
+    for _ in range(11):
+        assert planner.act_batch(observe).shape == (1, 2)
+    assert len(seen) == 3
+
+
 def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
     (whole,) = drive(config, tmp_path / "whole")

@@ -170,18 +170,17 @@ def drive_scenarios(
             return [row for position in positions for row in drive_scenarios(config, traffic, ids, [position])]
         row = {"scenario_id": ids[positions[0]], "traffic": traffic, **dict.fromkeys(ROW_SCORES, math.nan)}
         return [{"row": row, "missing": {FAILED: str(failure)}}]  # of one rollout counts for the scenario
-    return [_describe_results(traffic, of_scenario) for of_scenario in zip(*results)]
+    return [_build_row(ids[position], traffic, rows) for position, rows in zip(positions, zip(*results))]
 
 
-def _describe_results(traffic: str, results: Sequence[Result]) -> dict[str, object]:
+def _build_row(scenario_id: str, traffic: str, results: Sequence[Result]) -> dict[str, object]:
     """Row of a scenario by the results of the rollouts."""
     rows = [result.scores for result in results]
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
     collisions = [collision for result in results for collision in result.record.collisions]
     means["blamed_others_rate"] = blamed_others_rate(collisions)
-    records = [result.record for result in results]
-    realism, scenario_id = compute_traffic_realism(records), records[0].scene.scenario.scenario_id
+    realism = compute_traffic_realism([result.record for result in results])
     row = {"scenario_id": scenario_id, "traffic": traffic, **means, "others_realism": realism}
     return {"row": row, "missing": results[0].missing}
 
