@@ -2,13 +2,18 @@
 
     python benchmarks/planner_env.py speed [--rounds 3] [--model demo-base]
     python benchmarks/planner_env.py memory [--episodes 2000]
+    python benchmarks/planner_env.py drive --versions OLD/src src [--limit 32] [--rounds 3]
     python benchmarks/planner_env.py table --data synthetic --limit 40 [--models demo-base runs/tuned] [--jobs 2]
 
 Times are CPU time of this process with one thread; contestants of a ratio take turns, so that a busy machine slows both.
 """
 
 import argparse
+import os
 import resource
+import statistics
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -107,6 +112,36 @@ def resident_mb():
         return next(int(line.split()[1]) / 1024 for line in file if line.startswith("VmRSS"))
 
 
+DRIVE = """
+import sys, time
+from rlftsim.envs.drive import drive
+from rlftsim.envs.drive_scenario import DriveConfig
+planner, traffic, limit = sys.argv[1:]
+drive(DriveConfig(planner, traffic=(traffic,), limit=1))
+begin = time.process_time()
+drive(DriveConfig(planner, traffic=(traffic,), limit=int(limit)))
+print(int(limit) / (time.process_time() - begin))
+"""
+
+
+def compare_drive(arguments):
+    """Episodes per CPU second of `drive` by versions of the package, a process of each in turns."""
+    for planner in arguments.planners:
+        for traffic in arguments.traffic:
+            speeds = [[] for _ in arguments.versions]
+            for _ in range(arguments.rounds):
+                for version, measured in zip(arguments.versions, speeds):
+                    run = subprocess.run(
+                        [sys.executable, "-c", DRIVE, planner, traffic, str(arguments.limit)],
+                        env={**os.environ, "PYTHONPATH": version, "OMP_NUM_THREADS": "1"},
+                        capture_output=True, text=True, check=True,
+                    )  # fmt: skip
+                    measured.append(float(run.stdout))
+            best = ", ".join(f"{max(measured):.2f}" for measured in speeds)
+            ratios = ", ".join(f"{statistics.median(b / a for a, b in zip(speeds[0], m)):.2f}" for m in speeds[1:])
+            print(f"{planner} in {traffic}: {best} episodes per CPU second, {ratios} times the first", flush=True)
+
+
 def table(arguments):
     traffics = {"replay": None, "constant_velocity": None, "idm": None, **{f"policy {m}": m for m in arguments.models}}
     for planner in arguments.planners:
@@ -136,6 +171,13 @@ def main():
     one = verbs.add_parser("memory")
     one.add_argument("--episodes", type=int, default=2000)
     one.set_defaults(run=memory)
+    one = verbs.add_parser("drive")
+    one.add_argument("--versions", nargs="+", required=True, help="values of PYTHONPATH, the oldest first")
+    one.add_argument("--planners", nargs="*", default=["idm", "pdm"])
+    one.add_argument("--traffic", nargs="*", default=["replay", "policy"])
+    one.add_argument("--limit", type=int, default=32)
+    one.add_argument("--rounds", type=int, default=3)
+    one.set_defaults(run=compare_drive)
     one = verbs.add_parser("table")
     one.add_argument("--data", default="synthetic")
     one.add_argument("--split", default="validation")

@@ -95,12 +95,15 @@ def test_boxes_that_no_proposal_comes_near_change_no_bit(monkeypatch):
     for speed in (0.0, 4.0, 12.0):
         boxes = rng.uniform([-20, -40, -4, -12, -12], [120, 40, 4, 12, 12], (40, 5))
         sizes = rng.uniform([0.6, 0.6], [12.0, 3.0], (40, 2))
-        view = View(speed, np.array([4.6, 1.9]), line, heading, 13.0, boxes, sizes, np.inf, np.zeros((0, 4)))
+        view = View(
+            np.array([speed]), np.array([[4.6, 1.9]]), line[None], heading[None], np.array([13.0]), boxes[None],
+            sizes[None], np.ones((1, 40), bool), np.array([np.inf]), np.zeros((1, 0, 4)),
+        )  # fmt: skip
         is_near = pdm._nears_line(view)
         num_near += is_near.sum()
         proposals = pdm.simulate_proposals(view)
         with monkeypatch.context() as context:
-            context.setattr(pdm, "_nears_line", lambda view: np.ones(len(view.boxes), bool))
+            context.setattr(pdm, "_nears_line", lambda view: view.is_box)
             every_box = pdm.simulate_proposals(view)
         np.testing.assert_array_equal(proposals.motion, every_box.motion)
         np.testing.assert_array_equal(proposals.controls, every_box.controls)
@@ -358,14 +361,14 @@ def test_a_result_that_another_drive_finished_meanwhile_is_not_replaced_by_fewer
 
 def test_unfinished_parts_of_other_settings_outlive_a_repeated_drive(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
-    original, calls = drive_module.drive_scenario, []
+    original, calls = drive_module.drive_scenarios, []
 
     def second_fails(*arguments):
         calls.append(arguments)
         return original(*arguments) if len(calls) == 1 else 1 / 0
 
     with monkeypatch.context() as patch:
-        patch.setattr(drive_module, "drive_scenario", second_fails)
+        patch.setattr(drive_module, "drive_scenarios", second_fails)
         with pytest.raises(ZeroDivisionError):
             drive(replace(config, seed=1), tmp_path)
     parts = [*(tmp_path / "constant_velocity-replay.parts").glob("*.json")]
@@ -654,13 +657,110 @@ def test_a_cut_result_is_named_in_one_line(result_path, tmp_path, capsys):
     assert line.startswith(f"rlftsim: {cut}: cannot be read (")
 
 
+def drive_idm(**settings):
+    return drive(DriveConfig("idm", **{"traffic": ("replay",), **settings}))[0].table.to_pydict()
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm", "rlftsim.envs.planners.flawed:LateBraker"])
+def test_scenarios_side_by_side_have_the_scores_of_each_alone(name, monkeypatch):
+    config = DriveConfig(name, traffic=("replay", "policy"), limit=3, num_rollouts=2)
+    assert config.count_side_by_side("replay", 3) == 3
+    together = drive(config)
+    monkeypatch.setattr(DriveConfig, "count_side_by_side", lambda *_: 1)
+    for result, alone in zip(together, drive(config)):
+        np.testing.assert_equal(result.table.to_pydict(), alone.table.to_pydict())
+
+
+BATCH_PLANNERS = """
+import numpy as np
+from rlftsim.envs.planners.idm import IdmPlanner
+class Fails(IdmPlanner):
+    fails_in = {id!r}
+    def __init__(self):
+        self.scenarios = []
+    def reset(self, info):
+        self.scenarios.append(info["scenario"])
+    def act_batch(self, observe):
+        action = super().act_batch(observe)
+        if self.fails_in in self.scenarios:
+            raise ValueError("not here")
+        return action
+class NotANumber(Fails):
+    def act_batch(self, observe):
+        action = IdmPlanner.act_batch(self, observe)
+        action[np.array(self.scenarios) == self.fails_in] = np.nan
+        return action
+class Stands(IdmPlanner):
+    def act(self, observation):
+        return np.array([-1.0, 0.0], np.float32)
+"""
+
+
+def test_a_scenario_in_which_the_planner_fails_leaves_the_others_their_scores(tmp_path, monkeypatch):
+    second = open_dataset("synthetic", "validation").scenario_ids[1]
+    (tmp_path / "batches.py").write_text(BATCH_PLANNERS.format(id=second))
+    monkeypatch.syspath_prepend(tmp_path)
+    expected = drive_idm(limit=3)
+    for name, cause in (("Fails", "ValueError: not here"), ("NotANumber", "is nan")):
+        (result,) = drive(DriveConfig(f"batches:{name}", traffic=("replay",), limit=3))
+        assert result.failures.keys() == {second}
+        assert f"planner {name} fails at step 0 of scenario {second}: " in result.failures[second]
+        assert cause in result.failures[second]
+        for column, values in result.table.to_pydict().items():
+            np.testing.assert_equal(values[::2], expected[column][::2])
+    # who defines `act` alone is not driven by the batches of the class above
+    (stands,) = drive(DriveConfig("batches:Stands", traffic=("replay",), limit=2))
+    assert max(stands.values("route_completion")) < min(expected["route_completion"][:2])
+
+
+def test_an_interrupted_drive_side_by_side_does_what_is_missing(tmp_path, monkeypatch):
+    expected = drive_idm(limit=4)
+    original, driven = drive_module.drive_scenarios, []
+
+    def drive_two(*arguments):
+        driven.extend(arguments[-1])
+        return original(*arguments) if arguments[-1][0] == 0 else 1 / 0
+
+    config = DriveConfig("idm", traffic=("replay",), limit=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(DriveConfig, "count_side_by_side", lambda *_: 2)
+        patch.setattr(drive_module, "drive_scenarios", drive_two)
+        with pytest.raises(ZeroDivisionError):
+            drive(config, tmp_path)
+    driven.clear()
+    monkeypatch.setattr(drive_module, "drive_scenarios", lambda *a: driven.extend(a[-1]) or original(*a))
+    (result,) = drive(config, tmp_path)  # four at once, of which two are done
+    assert driven == [2, 3]
+    np.testing.assert_equal(result.table.to_pydict(), expected)
+    assert [path.name for path in tmp_path.iterdir()] == ["idm-replay.parquet"]
+
+
+def test_processes_share_scenarios_that_are_driven_side_by_side():
+    assert DriveConfig("idm", jobs=2).count_side_by_side("replay", 4) == 2
+    np.testing.assert_equal(drive_idm(limit=4, jobs=2), drive_idm(limit=4))
+
+
+def test_a_planner_that_follows_a_plan_asks_for_no_observation():
+    env, planner, seen = EgoEnv(data="synthetic", traffic="replay"), load_planner("pdm"), []
+    observation, info = env.reset(seed=0)
+
+    def observe():
+        seen.append(1)
+        return {name: array[None] for name, array in observation.items()}
+
+    planner.reset(info)
+    for _ in range(11):
+        assert planner.act_batch(observe).shape == (1, 2)
+    assert len(seen) == 3
+
+
 def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
     (whole,) = drive(config, tmp_path / "whole")
     first, second = whole.table["scenario_id"].to_pylist()
     driven = []
-    original = drive_module.drive_scenario
-    monkeypatch.setattr(drive_module, "drive_scenario", lambda *a: driven.append(a[-1]) or original(*a))
+    original = drive_module.drive_scenarios
+    monkeypatch.setattr(drive_module, "drive_scenarios", lambda *a: driven.extend(a[-1]) or original(*a))
     for number, edit in enumerate((
         lambda row: row,  # as it was: only the other scenario is driven
         lambda row: row.pop("comfort"),

@@ -5,13 +5,14 @@ Interrupted in any way, the same call goes on where the work stopped, see `evalu
 
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import rlftsim
-from rlftsim.envs.drive_scenario import ROW_SCORES, DriveConfig, drive_scenario, make_environment
+from rlftsim.envs.drive_scenario import ROW_SCORES, DriveConfig, drive_scenarios, make_environment
 from rlftsim.envs.planners.registry import hash_code
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
@@ -20,9 +21,10 @@ from rlftsim.evaluation.resumable import (
     check_scenarios_stay,
     claim_result,
     read_finished,
-    run_groups,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
+from rlftsim.jobs.items import ResultFormat, group_positions, run_items
+from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.dataset import dataset_folder
@@ -127,19 +129,67 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    format = ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
+    files = ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
     runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
-    with claim_result(path, format, ids, find, runner) as claim:
+    with claim_result(path, files, ids, find, runner) as claim:
         if claim.lease is not None:
-            work = partial(drive_scenario, config, settings.traffic, ids)
-            rows = run_groups(f"{config.planner} in {settings.traffic}", ids, work, format, claim.lease, runner)
+            groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
+            title, task = (
+                f"{config.planner} in {settings.traffic}",
+                partial(_drive_group, config, settings.traffic, files),
+            )
+            stored = run_items(title, groups, task, format=_Groups(files), lease=claim.lease, runner=runner)
+            rows = [row for group in stored for row in group]
             missing = {row["scenario_id"]: reasons for row, reasons in rows}
             claim.result = DriveResult.of(settings, [row for row, _ in rows], missing)
     assert claim.result is not None
     return claim.result
 
 
-def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+Row = tuple[dict[str, Any], dict[str, str]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Groups(ResultFormat[range, list[Row]]):
+    """Scenarios that are driven side by side, with a file for each."""
+
+    files: ScenarioValues[Row]
+
+    def read(self, item: range) -> list[Row] | None:
+        """Rows of all scenarios of a group, see `ResultFormat`."""
+        rows = [self.files.read(range(position, position + 1)) for position in item]
+        finished = [row for row in rows if row is not None]
+        return finished if len(finished) == len(item) else None
+
+    def count_units(self, item: range) -> int:
+        """Number of scenarios, see `ResultFormat`."""
+        return self.files.count_units(item)
+
+    def describe(self, item: range) -> str:
+        """First and last position, see `ResultFormat`."""
+        return self.files.describe(item)
+
+
+def _drive_group(
+    config: DriveConfig,
+    traffic: str,
+    files: ScenarioValues[Row],
+    group: range,
+    advance: Advance,
+    is_stopped: Callable[[], bool],
+) -> None:
+    """Drive the scenarios of a group that have no file."""
+    positions = [position for position in group if not files.is_finished(range(position, position + 1))]
+    advance(len(group) - len(positions))
+    if is_stopped():  # another process failed, or Ctrl-C
+        return
+    rows = drive_scenarios(config, traffic, files.scenario_ids, positions)
+    for position, row in zip(positions, rows):
+        files.write(range(position, position + 1), [row])
+    advance(len(positions))
+
+
+def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> Row:
     """Row of a scenario, and the scores that the scenario cannot give, as the file has both.
 
     Raises:

@@ -1,9 +1,9 @@
-"""A scenario driven by a planner: scores, and films."""
+"""Scenarios driven by a planner: scores, and films."""
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import cast
@@ -13,10 +13,15 @@ import numpy as np
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
+from rlftsim.envs.episode import advance, look, start
+from rlftsim.envs.planners.batch import BatchPlanner, acts_in_batches
 from rlftsim.envs.planners.registry import Planner, guard_planner, load_planner, read_action_settings
+from rlftsim.envs.record import build_record
+from rlftsim.envs.resets import describe_start
 from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
+from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, EpisodeFailure, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED, DriveResult, find_failures, is_failure, rank_scenarios
 from rlftsim.scenario.types import Scenario
@@ -25,6 +30,8 @@ from rlftsim.viewer.film import to_film
 
 ROW_SCORES = (*SCORE_NAMES, "blamed_others_rate", "others_realism")
 """Scores in the row of a scenario."""
+SIDE_BY_SIDE = 16
+"""Scenarios that a planner drives at once at most."""
 FILMS = re.compile(r"first|failures|worst:[1-9]\d{0,5}")
 
 
@@ -71,6 +78,18 @@ class DriveConfig:
             reward="none", **read_action_settings(load_planner(self.planner)),
         )  # fmt: skip
 
+    def count_side_by_side(self, traffic: str, num_scenarios: int) -> int:
+        """Number of scenarios that are driven at once, such that every process has some.
+
+        Args:
+            traffic: Driver of the other agents. Worlds of SUMO run one after the other; so does a traffic model, whose
+                last bits depend on what else is in a batch and may decide for another token.
+            num_scenarios: Number of scenarios in the whole work.
+        """
+        if traffic not in ("replay", "constant_velocity") or not acts_in_batches(load_planner(self.planner)):
+            return 1
+        return min(SIDE_BY_SIDE, max(num_scenarios // self.jobs, 1))
+
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
     """Drive a scenario from the current step to the end.
@@ -98,23 +117,71 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
     return env.result()
 
 
-def drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], position: int) -> dict[str, object]:
-    """Row of a scenario, and the scores that the scenario cannot give."""
+def run_batch(
+    source: Source, planner: BatchPlanner, scenarios: Sequence[Scenario], *, seed: int, rollouts: Iterable[int]
+) -> Iterator[list[Result]]:
+    """Drive scenarios side by side from the current step to the end; yields a result for each of them.
+
+    Args:
+        source: Source of the scenarios, with the planner's type of action.
+        planner: Planner that drives all egos.
+        scenarios: Scenarios to drive to the end.
+        seed: Seed of the traffic; equal seeds, equal traffic for every planner.
+        rollouts: Numbers of the rollouts, each with dice of its own.
+
+    Raises:
+        EpisodeFailure: SUMO fails, or the planner fails in any scenario.
+    """
+    # scores see at the end who has left the road: no event is asked for
+    episode = replace(source.episode(list(scenarios)), edges=None)
+    names = ", ".join(scenario.scenario_id for scenario in scenarios)
+    for rollout in rollouts:
+        state = start(episode, (Dice(seed, rollout),) * len(scenarios))
+        rows, step = range(len(scenarios)), 0
+        with guard_planner(planner, names, lambda: 0):
+            for row in rows:
+                planner.reset(describe_start(episode, state, row, source))
+        while not state.ended.all():
+            with guard_planner(planner, names, lambda now=step: now):
+                action = planner.act_batch(lambda now=state: look(episode, now).by_name())
+            with guard_planner(planner, names, lambda now=step: now, errors=(ConfigError,)):
+                state, _ = advance(episode, state, action)
+            step = state.world.step
+        yield [Result(build_record(episode, state, row)) for row in rows]
+
+
+def drive_scenarios(
+    config: DriveConfig, traffic: str, ids: Sequence[str], positions: Sequence[int]
+) -> list[dict[str, object]]:
+    """Rows of scenarios that are driven side by side, and the scores that each scenario cannot give."""
     env, planner = make_environment(config, traffic), load_planner(config.planner)
-    scenario = env.source.scenario(ids[position])
-    rollouts = range(config.num_rollouts)
+    scenarios = [env.source.scenario(ids[position]) for position in positions]
+    rollouts, seed = range(config.num_rollouts), config.seed
     try:
-        results = [run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in rollouts]
-    except EpisodeFailure as failure:  # of one rollout counts for the scenario
-        row = {"scenario_id": ids[position], "traffic": traffic, **dict.fromkeys(ROW_SCORES, math.nan)}
-        return {"row": row, "missing": {FAILED: str(failure)}}
+        if acts_in_batches(planner):
+            results = list(run_batch(env.source, planner, scenarios, seed=seed, rollouts=rollouts))
+        else:
+            results = [
+                [run_planner(env, planner, scenario, seed=seed, rollout=rollout) for scenario in scenarios]
+                for rollout in rollouts
+            ]
+    except EpisodeFailure as failure:
+        if len(positions) > 1:  # the scenarios in which nothing fails have their scores
+            return [row for position in positions for row in drive_scenarios(config, traffic, ids, [position])]
+        row = {"scenario_id": ids[positions[0]], "traffic": traffic, **dict.fromkeys(ROW_SCORES, math.nan)}
+        return [{"row": row, "missing": {FAILED: str(failure)}}]  # of one rollout counts for the scenario
+    return [_build_row(ids[position], traffic, rows) for position, rows in zip(positions, zip(*results))]
+
+
+def _build_row(scenario_id: str, traffic: str, results: Sequence[Result]) -> dict[str, object]:
+    """Row of a scenario by the results of the rollouts."""
     rows = [result.scores for result in results]
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
     collisions = [collision for result in results for collision in result.record.collisions]
     means["blamed_others_rate"] = blamed_others_rate(collisions)
     realism = compute_traffic_realism([result.record for result in results])
-    row = {"scenario_id": ids[position], "traffic": traffic, **means, "others_realism": realism}
+    row = {"scenario_id": scenario_id, "traffic": traffic, **means, "others_realism": realism}
     return {"row": row, "missing": results[0].missing}
 
 

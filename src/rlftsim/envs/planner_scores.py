@@ -148,8 +148,8 @@ class _Steps:
 
 
 def _measure_steps(record: Record) -> _Steps:
-    angle, limit, _ = _lane_headings(record)
-    return _Steps(off_road(record), angle, limit, compute_times_to_collision(record))
+    angle, limit, junction = _lane_headings(record)
+    return _Steps(off_road(record), angle, limit, _compute_times_to_collision(record, junction))
 
 
 def _score_components(record: Record, steps: _Steps, kinematics: "_Kinematics") -> dict[str, float]:
@@ -198,8 +198,11 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
         clockwise_corners(motion[:, :2], motion[:, 2], scene.size[record.agent]) + scene.scenario.origin
     )  # [T + 1, 4, 2]
     z = np.repeat(record.ground[record.agent][:, None, None], 4, 1)
-    groups = torch.from_numpy(np.concatenate([corners, z], -1)).float()
-    return compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS).amax(-1).double().numpy()
+    points = torch.from_numpy(np.concatenate([corners, z], -1)).float()
+    # the corners of a few steps lie close together
+    groups = points.reshape(-1, 4 * math.gcd(len(points), 9), 3)
+    distance = compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS)
+    return distance.view(-1, 4).amax(-1).double().numpy()
 
 
 def _gained(route: Route, motion: Float[np.ndarray, "T1 5"]) -> float:
@@ -252,7 +255,7 @@ def _speed_score(record: Record, limit: Float[np.ndarray, "T1"]) -> float:
     return max(0.0, 1.0 - float(over.mean()) / OVER_SPEED_MPS) if len(over) else 1.0
 
 
-def compute_times_to_collision(record: Record) -> Float[np.ndarray, "T1"]:
+def _compute_times_to_collision(record: Record, junction: Bool[np.ndarray, "T1"]) -> Float[np.ndarray, "T1"]:
     """Time from each step until a box is met at constant speeds and headings, s; at most 3.
 
     Tracks ahead and crossing tracks count. Tracks beside the agent count only while the agent is not in a single lane,
@@ -264,7 +267,6 @@ def compute_times_to_collision(record: Record) -> Float[np.ndarray, "T1"]:
     offset = motion[..., :2] - agent_motion[:, :2]  # [A, T + 1, 2]
     bearing = np.abs(wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - agent_motion[:, 2]))
     crossing = np.abs(np.sin(motion[..., 2] - agent_motion[:, 2])) > np.sin(CROSSING_RAD)
-    _, _, junction = _lane_headings(record)
     is_in_lane = in_one_lane(record.scene, agent_motion, size[record.agent], record.ground[record.agent])
     counts_lateral = ~is_in_lane | junction
     counts = record.is_observed & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | counts_lateral)

@@ -33,7 +33,7 @@ class Result:
     @cached_property
     def traffic(self) -> TrafficScores:
         """Scores of the traffic around the planner."""
-        return score_traffic(self.record)
+        return score_traffic(self.record, self.planner.least_ttc_s)
 
     @property
     def scores(self) -> dict[str, float]:

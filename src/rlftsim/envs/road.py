@@ -38,11 +38,21 @@ def nearest_edges(
     edges = edges[:, None]  # [n, 1, e, 4]
     dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]
     to_x, to_y = points[..., :1] - edges[..., 0], points[..., 1:] - edges[..., 1]  # [n, p, e]
-    position = (to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-9)
-    clipped_position = np.clip(position, 0.0, 1.0)
-    off_x, off_y = to_x - clipped_position * dx, to_y - clipped_position * dy
-    squared = off_x * off_x + off_y * off_y
+    position = to_x * dx
+    position += to_y * dy
+    position /= np.maximum(dx * dx + dy * dy, 1e-9)
+    clipped_position = position.clip(0.0, 1.0)
+    squared = _square(to_x - clipped_position * dx)
+    squared += _square(to_y - clipped_position * dy)
     nearest = squared.argmin(-1)[..., None]
-    distance = np.sqrt(np.take_along_axis(squared, nearest, -1))[..., 0]
-    side = np.take_along_axis(dx * to_y - dy * to_x, nearest, -1)[..., 0]
-    return distance, side, np.take_along_axis(clipped_position == position, nearest, -1)[..., 0]
+    values = (squared, dx, dy, to_x, to_y, position)
+    squared, dx, dy, to_x, to_y, position = (
+        np.take_along_axis(np.broadcast_to(value, to_x.shape), nearest, -1)[..., 0] for value in values
+    )
+    return np.sqrt(squared), dx * to_y - dy * to_x, (position >= 0.0) & (position <= 1.0)
+
+
+def _square(values: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
+    """Squares, which take the place of the values."""
+    values *= values
+    return values

@@ -160,17 +160,20 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
         return NO_ROUTE
     points = sample_line(line, SPACING_M)
     heading = compute_headings(points)
-    # lanes and limits: of the nearest lane point that runs the same way
+    # lanes and limits: of the nearest lane point that runs the same way; farther ones do not count
     graph = scene.graph
-    offset = np.linalg.norm(points[:, None] - (graph.points[:, :2] - scene.scenario.origin), axis=-1)  # [R, P]
-    offset[np.abs(wrapped(graph.heading - heading[:, None])) > ALONG_RAD] = np.inf
+    graph_points = graph.points[:, :2] - scene.scenario.origin
+    is_close = (graph_points >= points.min(0) - NEAR_LANE_M) & (graph_points <= points.max(0) + NEAR_LANE_M)
+    candidates = np.append(np.flatnonzero(is_close.all(1)), 0)  # at least one
+    offset = np.linalg.norm(points[:, None] - graph_points[candidates], axis=-1)  # [R, P]
+    offset[np.abs(wrapped(graph.heading[candidates] - heading[:, None])) > ALONG_RAD] = np.inf
     ground = np.zeros(len(points))
     if scene.levels is not None:
         ground = scene.levels.follow_lines(points[None], np.array([scene.z[agent] - scene.size[agent, 2] / 2]))[0]
-        offset[~is_on_level(graph.points[:, 2] - ground[:, None])] = np.inf
+        offset[~is_on_level(graph.points[candidates, 2] - ground[:, None])] = np.inf
     nearest = offset.argmin(1)
     on_lane = offset[np.arange(len(points)), nearest] <= NEAR_LANE_M
-    owner = graph.owner[nearest]
+    owner = graph.owner[candidates[nearest]]
     limit = np.where(on_lane, graph.speed_limit_mps[owner], 0.0)
     return Route(points, heading, ground, limit, np.unique(owner[on_lane]), source)
 

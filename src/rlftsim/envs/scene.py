@@ -4,7 +4,6 @@ Frame: map (centered on the scenario, meters), float64. Built once per scenario 
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -211,15 +210,16 @@ def _cut_edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, 
     for index in features.find_indices(ROAD_EDGE_TYPES):
         line = features.polyline(index).astype(np.float64) - [*scenario.origin, 0.0]
         line = line[np.isfinite(line[:, :2]).all(1)]
-        for start, end in pairwise(simplify(line[:, :2])):
-            count = max(1, int(np.ceil(np.linalg.norm(end - start) / SEGMENT_LENGTH_M)))
-            cuts = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
-            segments.append(np.concatenate([cuts[:-1], cuts[1:]], axis=1))
-            if has_levels:
-                middle = (cuts[:-1] + cuts[1:]) / 2
-                heights.append(line[((line[:, None, :2] - middle) ** 2).sum(-1).argmin(0), 2])
-            else:
-                heights.append(np.zeros(count))
+        corners = simplify(line[:, :2])
+        start, way = corners[:-1], np.diff(corners, axis=0)
+        counts = np.ceil(np.hypot(way[:, 0], way[:, 1]) / SEGMENT_LENGTH_M).astype(int).clip(1)
+        owner = np.repeat(np.arange(len(counts)), counts)
+        piece = np.arange(len(owner)) - (counts.cumsum() - counts)[owner]
+        begin, end = (start[owner] + (k / counts[owner])[:, None] * way[owner] for k in (piece, piece + 1))
+        segments.append(np.concatenate([begin, end], axis=1))
+        middle = (begin + end) / 2
+        nearest = ((line[:, None, :2] - middle) ** 2).sum(-1).argmin(0) if has_levels and len(middle) else owner
+        heights.append(line[nearest, 2] if has_levels else np.zeros(len(middle)))
     return np.concatenate(segments), np.concatenate(heights)
 
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Int64, Shaped
 
 from rlftsim.envs.contact import Collision, lane_search
-from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS, compute_times_to_collision
+from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
@@ -50,8 +50,13 @@ class TrafficScores:
     """Of the contacts with the planner's agent, the fraction that was not its fault; NaN without a contact."""
 
 
-def score_traffic(record: Record) -> TrafficScores:
-    """Events of the other agents in an episode."""
+def score_traffic(record: Record, least_ttc_s: float) -> TrafficScores:
+    """Events of the other agents in an episode.
+
+    Args:
+        record: Record of the episode; a short episode is scored up to the end.
+        least_ttc_s: Least time to collision of the planner's agent, as `PlannerScores` has it, s.
+    """
     scene, motion = record.scene, record.motion
     is_traffic = np.arange(len(scene.object_id)) != record.agent
     is_vehicle = is_traffic & (scene.object_type == ObjectType.VEHICLE)
@@ -75,9 +80,9 @@ def score_traffic(record: Record) -> TrafficScores:
     tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
     return TrafficScores(
         ego_contacts=float(len(record.collisions)),
-        risky_approach_rate=float(compute_times_to_collision(record).min() < RISKY_TTC_S),
+        risky_approach_rate=float(least_ttc_s < RISKY_TTC_S),
         others_collision_rate=_rate(overlaps, is_traffic),
-        others_offroad_rate=_rate(_leaves_road(record), is_vehicle & has_edges),
+        others_offroad_rate=_rate(_leaves_road(record, is_vehicle), is_vehicle & has_edges),
         others_wrong_way_rate=_rate(_drives_against(record, is_vehicle), is_vehicle & has_lanes),
         others_acceleration_rate=_rate(np.any(jolt, axis=1), is_vehicle),
         others_steering_rate=_rate(np.any(tight, axis=1), is_vehicle),
@@ -101,17 +106,26 @@ def _runs(values: Shaped[np.ndarray, "A t"], length: int) -> Shaped[np.ndarray, 
     return np.lib.stride_tricks.sliding_window_view(values, length, axis=1)
 
 
-def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
-    """True = a corner leaves the road during the episode; agents off the road from the start do not count."""
-    edges, scene = road_edges(record.scene.scenario), record.scene
+def _leaves_road(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:
+    """True = a vehicle's corner leaves the road during the episode; off the road from the start does not count."""
+    edges, scene, leaves = road_edges(record.scene.scenario), record.scene, np.zeros(len(vehicles), bool)
     if edges is None:
-        return np.zeros(len(scene.object_id), bool)
+        return leaves
     x, y = np.moveaxis(record.motion[..., :2] + scene.scenario.origin, -1, 0)
-    motion = (x, y, record.z, record.motion[..., 2])
-    states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in motion))
-    size = torch.from_numpy(scene.size).float()
-    off = compute_distance_to_road_edge(states, size[:, None], edges, max_pairs=MAX_PAIRS)[0].numpy()
-    return ((off >= OUTSIDE_M) & record.is_observed).any(1) & (off[:, 0] < OUTSIDE_M)
+    pose = np.stack([x, y, record.z, record.motion[..., 2]])  # [4, A, T + 1]
+
+    def is_off(agents: np.ndarray, steps: slice) -> Bool[np.ndarray, "n t"]:
+        states = Trajectories(*torch.from_numpy(pose[:, agents, steps]).float()[:, None])
+        size = torch.from_numpy(scene.size[agents, None]).float()
+        return compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy() >= OUTSIDE_M
+
+    # those that stand do not leave the road
+    agents = np.flatnonzero(vehicles & (pose != pose[..., :1]).any((0, 2)))
+    if len(agents):
+        agents = agents[~is_off(agents, slice(1))[:, 0]]
+    if len(agents):
+        leaves[agents] = (is_off(agents, slice(1, None)) & record.is_observed[agents, 1:]).any(1)
+    return leaves
 
 
 def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:

@@ -371,8 +371,10 @@ def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOL
             continue
         inner, segment = points[start + 1 : stop], points[stop] - points[start]
         # Position of the nearest point of the segment, 0 at its start and 1 at its end; a segment may have no length.
-        fraction = np.clip((inner - points[start]) @ segment / max(float(segment @ segment), 1e-12), 0, 1)
-        distance = np.linalg.norm(inner - points[start] - fraction[:, None] * segment, axis=-1)
+        offset = inner - points[start]
+        fraction = (offset @ segment / max(float(segment @ segment), 1e-12)).clip(0, 1)
+        offset -= fraction[:, None] * segment
+        distance = np.sqrt(offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1])
         farthest = int(distance.argmax())
         if distance[farthest] > tolerance_m:
             middle = start + 1 + farthest

@@ -1,16 +1,15 @@
 """A planner that follows the route and keeps a distance, with nuPlan's parameters."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
 from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD, ActionType, pursue, pursuit_m
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration, find_leaders
-from rlftsim.envs.planners.view import read_view
+from rlftsim.envs.planners.batch import BatchPlanner, Observe
+from rlftsim.envs.planners.view import View, read_view
 
 
-class IdmPlanner:
+class IdmPlanner(BatchPlanner):
     """The intelligent driver model along the route, steered by pure pursuit.
 
     Args:
@@ -20,22 +19,23 @@ class IdmPlanner:
     action: ActionType = "bicycle"
     config = IdmConfig()
 
-    def reset(self, info: dict[str, Any]) -> None:
-        """Do nothing: an IDM planner has no memory."""
-
-    def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "2"]:
+    def act_batch(self, observe: Observe) -> Float[np.ndarray, "M 2"]:
         """Acceleration behind the leader, steering for the route."""
-        view = read_view(observation)
-        window = slice(0, LOOKAHEAD_M)
-        is_box = np.ones((1, len(view.boxes)), bool)
-        gap, lead = find_leaders(
-            view.line[None, window], view.heading[None, window], view.size[None], view.boxes[None],
-            view.box_size[None], is_box,
-        )  # fmt: skip
-        to_stop = np.maximum(view.stop_m - view.size[0] / 2, 0.0)
+        view = read_view(observe())
+        gap, lead = find_view_leaders(view)
+        to_stop = np.maximum(view.stop_m - view.size[:, 0] / 2, 0.0)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
-        free_speed, speed = np.array([view.limit_mps or self.config.speed_mps]), np.array([max(view.speed, 0.0)])
+        free_speed = np.where(view.limit_mps > 0, view.limit_mps, self.config.speed_mps)
+        speed = np.maximum(view.speed, 0.0)
         acceleration = compute_idm_acceleration(speed, free_speed, gap, lead, self.config)
-        far_points = np.flatnonzero(np.linalg.norm(view.line, axis=1) >= pursuit_m(speed))
-        steering = pursue(view.line[None, far_points[0] if len(far_points) else -1], view.size[:1])
-        return np.clip([acceleration[0] / ACCELERATION_MPS2, steering[0] / STEERING_RAD], -1, 1).astype(np.float32)
+        is_far = np.linalg.norm(view.line, axis=-1) >= pursuit_m(speed)[:, None]  # [M, P]
+        target = np.where(is_far.any(1), is_far.argmax(1), -1)
+        steering = pursue(view.line[np.arange(len(target)), target], view.size[:, 0])
+        action = np.stack([acceleration / ACCELERATION_MPS2, steering / STEERING_RAD], -1)
+        return np.clip(action, -1, 1).astype(np.float32)
+
+
+def find_view_leaders(view: View) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+    """Gap to the first box on the next 40 m of each route, and the box's speed along it, see `find_leaders`."""
+    ahead = slice(0, LOOKAHEAD_M)
+    return find_leaders(view.line[:, ahead], view.heading[:, ahead], view.size, view.boxes, view.box_size, view.is_box)

@@ -1,69 +1,110 @@
-"""View of planners that follow a route: the route as a line, boxes and stopping places on the line."""
+"""View of planners that follow a route: the route as a line, boxes and stopping places on the line.
 
+M agents in as many scenes; lines of P points, K boxes, E edges, padded.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.idm import LOOKAHEAD_M, ON_LINE_M
-from rlftsim.envs.route import compute_headings, sample_line
 
 STRAIGHT_M = 80.0
 """Without a route a planner drives straight on."""
+FAR_M = 1e7
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Frame: the agent's own, x ahead; meters, seconds."""
+    """Frame: each agent's own, x ahead; meters, seconds."""
 
-    speed: float
-    size: Float[np.ndarray, "2"]
-    line: Float[np.ndarray, "P 2"]
-    """The route, a point every meter from the nearest place on."""
-    heading: Float[np.ndarray, "P"]
-    limit_mps: float
+    speed: Float[np.ndarray, "M"]
+    size: Float[np.ndarray, "M 2"]
+    line: Float[np.ndarray, "M P 2"]
+    """The route, a point every meter from the nearest place on; the last point is repeated."""
+    heading: Float[np.ndarray, "M P"]
+    limit_mps: Float[np.ndarray, "M"]
     """Speed limit here; 0 = unknown."""
-    boxes: Float[np.ndarray, "K 5"]
+    boxes: Float[np.ndarray, "M K 5"]
     """x, y, heading, vx, vy."""
-    box_size: Float[np.ndarray, "K 2"]
-    stop_m: float
+    box_size: Float[np.ndarray, "M K 2"]
+    is_box: Bool[np.ndarray, "M K"]
+    """False = padding."""
+    stop_m: Float[np.ndarray, "M"]
     """Distance along the line to the nearest red or yellow light on it; infinite without one."""
-    edges: Float[np.ndarray, "E 4"]
+    edges: Float[np.ndarray, "M E 4"]
+    """Padding is far away."""
 
 
-def read_view(observation: dict[str, Any]) -> View:
-    """View of an observation in the agent's frame, of kind "dict"."""
-    ego, is_neighbor = observation["ego"].astype(float), observation["neighbors_mask"].astype(bool)
-    route = observation["route"][observation["route_mask"].astype(bool)].astype(float)
-    neighbors = observation["neighbors"][is_neighbor].astype(float)
-    line = route[:, :2] if len(route) > 1 else np.array([[0.0, 0.0], [STRAIGHT_M, 0.0]])
-    # beyond its end the route goes straight on, so that a planner never stops for want of a line
-    last = line[-1] - line[-2]
-    last /= max(float(np.linalg.norm(last)), 1e-6)
-    line = sample_line(np.vstack([line, line[-1] + LOOKAHEAD_M * last]), 1.0)
+def read_view(observation: Mapping[str, np.ndarray]) -> View:
+    """View of observations in the agents' frames, of kind "dict" with a leading axis M."""
+    ego, route = observation["ego"].astype(float), observation["route"].astype(float)
+    is_box = observation["neighbors_mask"].astype(bool)
+    is_box = is_box[:, : np.count_nonzero(is_box.any(0))]  # the nearest come first
+    neighbors = observation["neighbors"][:, : is_box.shape[1]].astype(float)
+    num_points = np.count_nonzero(observation["route_mask"], axis=1)
+    line, heading = _extend_routes(route[..., :2], num_points)
+    turn = np.arctan2(neighbors[..., 3], neighbors[..., 2])[..., None]
     return View(
-        speed=float(ego[0]),
-        size=ego[4:6],
+        speed=ego[:, 0],
+        size=ego[:, 4:6],
         line=line,
-        heading=np.unwrap(compute_headings(line)),
-        limit_mps=float(route[0, 2]) if len(route) else 0.0,
-        boxes=np.concatenate(
-            [neighbors[:, :2], np.arctan2(neighbors[:, 3], neighbors[:, 2])[:, None], neighbors[:, 4:6]], 1
-        ),
-        box_size=neighbors[:, 6:8],
-        stop_m=_stop(observation, line, float(ego[4])),
-        edges=observation["edges"][observation["edges_mask"].astype(bool)].astype(float),
+        heading=heading,
+        limit_mps=np.where(num_points > 0, route[:, 0, 2], 0.0),
+        boxes=np.concatenate([neighbors[..., :2], turn, neighbors[..., 4:6]], -1),
+        box_size=neighbors[..., 6:8],
+        is_box=is_box,
+        stop_m=_find_stops(observation, line, ego[:, 4]),
+        edges=np.where(observation["edges_mask"][..., None] > 0, observation["edges"].astype(float), FAR_M),
     )
 
 
-def _stop(observation: dict[str, Any], line: Float[np.ndarray, "P 2"], length: float) -> float:
-    lights = observation["lights"][observation["lights_mask"].astype(bool)].astype(float)
-    waits = lights[:, 2:4].any(1)
-    points = lights[waits, :2]
-    if not len(points):
-        return np.inf
-    distance = np.linalg.norm(line[:, None] - points, axis=-1)  # [P, T]
-    # a stop point that the front has passed is behind
-    on_line = (distance.min(0) <= ON_LINE_M) & (points[:, 0] >= length / 2 - 1.0)
-    return float(distance.argmin(0)[on_line].min()) if on_line.any() else np.inf
+def _extend_routes(
+    route: Float[np.ndarray, "M R 2"], num_points: Int64[np.ndarray, "M"]
+) -> tuple[Float[np.ndarray, "M P 2"], Float[np.ndarray, "M P"]]:
+    """Points a meter apart along routes, and the directions there.
+
+    Beyond its end a route goes straight on, so that a planner never stops for want of a line.
+    """
+    row, end = np.arange(len(route)), np.maximum(num_points, 2)
+    points = np.concatenate([route, np.zeros_like(route[:, :1])], 1)
+    points[num_points < 2, :2] = [[0.0, 0.0], [STRAIGHT_M, 0.0]]
+    last = points[row, end - 1] - points[row, end - 2]
+    last /= np.maximum(np.linalg.norm(last, axis=-1, keepdims=True), 1e-6)
+    beyond = points[row, end - 1] + LOOKAHEAD_M * last
+    points = np.where((np.arange(points.shape[1]) < end[:, None])[..., None], points, beyond[:, None])
+    # 1. as `sample_line`: the segment that each full meter lies on
+    step = np.diff(points, axis=1)
+    distance = np.cumsum(np.linalg.norm(step, axis=-1), axis=1)  # [M, R] to the end of each segment
+    final = np.ceil(distance[:, -1] + 1e-6).astype(int) - 1
+    along = np.minimum(np.arange(final.max() + 1), final[:, None])  # [M, P]
+    segment = (distance[:, None] <= along[..., None]).sum(-1)
+    segment = np.minimum(segment, end[:, None] - 1)
+    start = np.pad(distance, ((0, 0), (1, 0)))
+    slope = step / np.maximum(np.diff(start, axis=1), 1e-9)[..., None]
+    rows = row[:, None]
+    rest = np.minimum(along, distance[:, -1:]) - start[rows, segment]
+    line = slope[rows, segment] * rest[..., None] + points[rows, segment]
+    # 2. directions to the next point
+    turn = np.diff(line, axis=1)
+    turn = np.arctan2(turn[..., 1], turn[..., 0])[rows, np.minimum(np.arange(along.shape[1]), final[:, None] - 1)]
+    return line, np.unwrap(turn)
+
+
+def _find_stops(
+    observation: Mapping[str, np.ndarray], line: Float[np.ndarray, "M P 2"], length: Float[np.ndarray, "M"]
+) -> Float[np.ndarray, "M"]:
+    """Distances along the lines to the nearest red or yellow lights that the fronts have not passed."""
+    lights = observation["lights"].astype(float)
+    waits = (observation["lights_mask"] > 0) & lights[..., 2:4].any(-1)
+    waits &= lights[..., 0] >= length[:, None] / 2 - 1.0
+    if not waits.any():
+        return np.full(len(line), np.inf)
+    agent, light = np.nonzero(waits)
+    x, y = (line[agent, :, axis] - lights[agent, light, axis, None] for axis in range(2))  # [n, P]
+    distance = np.sqrt(x * x + y * y)
+    stop = np.full(waits.shape, np.inf)
+    stop[agent, light] = np.where(distance.min(1) <= ON_LINE_M, distance.argmin(1), np.inf)
+    return stop.min(1)
