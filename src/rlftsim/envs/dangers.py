@@ -206,7 +206,7 @@ class RedLight:
         scene, agent = view.index
         world = view.episode.world
         lights = find_lights(world, view.state.world)[scene]
-        if find_signals(world.scenes[scene].scenario) is None:
+        if find_signals(world.scenes[scene].scenario, world.scenes[scene].num_steps) is None:
             return NEVER
         driven = np.stack([m[scene, agent, :2] for m in view.state.world.track[CURRENT_STEP:]])
         if passes_red_light(replace(world.scenes[scene], lights=lights), driven):

@@ -15,7 +15,7 @@ from rlftsim.envs.route import compute_headings, sample_line
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.polylines import arc_length, resample_to
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 LOOKAHEAD_M = 40
 """Leaders are searched so far ahead, as nuPlan's planner does."""
@@ -201,7 +201,7 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
 
 def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
     """Poses of an agent's log where the agent moves, and a last pose straight on."""
-    logged = scene.logged[agent, CURRENT_STEP:TOTAL_STEPS]
+    logged = scene.logged[agent, CURRENT_STEP:]
     step = np.linalg.norm(np.diff(logged[:, :2], axis=0), axis=1)
     poses = logged[np.append(True, step > 0.05), :3]
     direction = logged[0, 2] + (np.pi if signed_speed(logged[:1])[0] < 0 else 0.0)
@@ -303,7 +303,7 @@ def advance_idm(
     gap, lead = find_leaders(line, heading, size[lines.agents], motion[nearest], size[nearest], mask)
     # 2. A red or yellow light ahead is a standing leader.
     front = position_m + size[lines.agents, 0] / 2
-    waits = np.isin(scene.lights.state[min(step, TOTAL_STEPS - 1)], (RED, YELLOW))
+    waits = np.isin(scene.lights.state[step], (RED, YELLOW))
     to_stop = np.where(waits & (lines.stop_m >= front[:, None]), lines.stop_m - front[:, None], np.inf)
     to_stop = to_stop.min(1, initial=np.inf)
     lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)

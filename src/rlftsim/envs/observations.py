@@ -21,7 +21,7 @@ from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW, Lights
 from rlftsim.envs.world import World, WorldState, find_lights, find_presence, padded
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import heights_overlap, wrapped
-from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
+from rlftsim.scenario.types import STEP_S
 
 Frame = Literal["ego", "world"]
 
@@ -112,7 +112,7 @@ class Atlas:
     """Space for points, class, speed limit, space for the light, on the route, stop sign."""
     lane_light: Int64[np.ndarray, "M n"]
     """Index of the light among those of all agents; an agent's last one is none."""
-    lights: tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]
+    lights: tuple[Int64[np.ndarray, "S B T1"], Float[np.ndarray, "S B T1"]]
     """States and ages of the lights in the log; the last light is none, far away."""
     agent_facts: Float32[np.ndarray, "B A 3"]
     """Length, width, class."""
@@ -193,9 +193,10 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
             middle = middles[name]
             padded_z = padded(z, (len(scenes), middle.shape[1]))[rows]
             heights[name] = RouteHeights.measure(middle[..., None].view(np.float64), padded_z, route_xy, route_ground)
-    last_logged = np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2)
+    steps = np.arange(world.valid.shape[2])
+    last_logged = np.maximum.accumulate(np.where(world.valid, steps, 0), axis=2)
     # replayed agents alone have a log to go by
-    age = np.where((world.drivers == Driver.REPLAY)[..., None], STEP_S * (np.arange(TOTAL_STEPS) - last_logged), 0.0)
+    age = np.where((world.drivers == Driver.REPLAY)[..., None], STEP_S * (steps - last_logged), 0.0)
     return Atlas(
         x=np.concatenate([np.real(middle) for middle in middles.values()], 1),
         y=np.concatenate([np.imag(middle) for middle in middles.values()], 1),
@@ -231,9 +232,9 @@ def _to_complex(points: Float[np.ndarray, "*n c"]) -> Complex[np.ndarray, "*n p"
 
 def _stack_lights(
     lights: Sequence[Lights], count: int
-) -> tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]:
+) -> tuple[Int64[np.ndarray, "S B T1"], Float[np.ndarray, "S B T1"]]:
     """States and ages of the lights of each scene, padded with lights that are none."""
-    shape = len(lights), count, TOTAL_STEPS
+    shape = len(lights), count, len(lights[0].state)
     states, ages = padded([s.state.T for s in lights], shape, 0), padded([s.age_s.T for s in lights], shape)
     return np.moveaxis(states, 2, 0), np.moveaxis(ages, 2, 0)
 

@@ -351,9 +351,14 @@ def _comfort(motion: _Kinematics) -> float:
 
 
 @cached_on_scenario
-def find_signals(scenario: Scenario) -> Signals | None:
-    """Traffic lights of a scenario, with the lanes that they are on; None without any."""
-    return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
+def find_signals(scenario: Scenario, num_steps: int) -> Signals | None:
+    """Traffic lights of a scenario, with the lanes that they are on; None without any.
+
+    Args:
+        scenario: Scenario with the map and the logged lights.
+        num_steps: Number of steps of the log's time; lights that are not logged are not red.
+    """
+    return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"), num_steps)
 
 
 def passes_red_light(scene: Scene, driven: Float[np.ndarray, "T1 2"]) -> bool:
@@ -364,11 +369,12 @@ def passes_red_light(scene: Scene, driven: Float[np.ndarray, "T1 2"]) -> bool:
         driven: Positions [T + 1, 2] of the agent from the current step on, map frame, m.
     """
     scenario, num_steps = scene.scenario, len(driven) - 1
-    signals = find_signals(scenario)
+    signals = find_signals(scenario, scene.num_steps)
     if signals is None or not num_steps:
         return False
-    if scene.lights is not build_env_scene(scenario).lights:  # as SUMO showed them
-        signals = build_signals(scenario.map_features, scene.lights.log(scenario.lights), torch.device("cpu"))
+    if scene.lights is not build_env_scene(scenario, scene.num_steps).lights:  # as SUMO showed them
+        lights = scene.lights.log(scenario.lights)
+        signals = build_signals(scenario.map_features, lights, torch.device("cpu"), scene.num_steps)
         assert signals is not None
     x, y = torch.from_numpy(driven + scenario.origin).float().T[:, None, None]
     valid = torch.ones(1, 1, num_steps, dtype=torch.bool)

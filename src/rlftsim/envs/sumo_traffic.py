@@ -26,7 +26,7 @@ from rlftsim.scenario.synthetic.causal import BodyState, SumoPose, advance_body
 from rlftsim.scenario.synthetic.crop import on_grid
 from rlftsim.scenario.synthetic.windows import HEADING_GRID_PER_RAD, POSITION_GRID_PER_M, VELOCITY_GRID_PER_MPS
 from rlftsim.scenario.synthetic.worlds import REMEDY, WindowSource, find_window
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 WORKER = "rlftsim.scenario.synthetic.rerun"
 MAX_WORLDS = 16
@@ -108,7 +108,7 @@ def build_sumo_scene(scene: Scene, data: Path) -> SumoScene:
 
 def begin_sumo(sumo_scene: SumoScene, scene: Scene) -> SumoState:
     """State at the current step of the log."""
-    last_step = np.full(len(scene.object_id), TOTAL_STEPS)
+    last_step = np.full(len(scene.object_id), scene.num_steps)
     return SumoState((), tuple(track.state for track in sumo_scene.window.tracks), last_step, scene.lights)
 
 
