@@ -51,7 +51,7 @@ class EnvConfig:
     stop_on: tuple[StopReason, ...] = ("collision",)
     """Events of the planner's agent that end its episode."""
     max_steps: int = FUTURE_STEPS
-    """Length of an episode in steps of 0.1 s."""
+    """Length of an episode in steps of 0.1 s; later than second 8 it ends where the map does."""
     route: RouteChoice = "logged"
     """"logged" (the lanes that the logged ego drove), "none", a maneuver, or lane ids."""
     temperature: float = 1.0

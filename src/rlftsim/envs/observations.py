@@ -33,7 +33,8 @@ BOUND = 1e4
 HISTORY = 10
 OWN_LANES = 12
 """Nearest pieces that an agent's own lane is searched among."""
-_FAR_M = 1e7
+FAR_M = 1e7
+"""Coordinate of padding."""
 _ROW_BITS = (1 << 24) - 1
 _SEEN_KEY = int(np.float64(SEEN_M * SEEN_M).view(np.int64)) | _ROW_BITS
 _COLORS = np.array([RED, YELLOW, GREEN])
@@ -156,19 +157,19 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         lane_rows[row, :, -2] = np.isin(owner[rows[row]], route.lanes)
     lane_light = [np.where(s.lanes.light < 0, num_lights - 1, s.lanes.light) for s in scenes]
     lane_light = _stack(lane_light, num_lights - 1, LANES)[rows] + num_lights * np.arange(len(rows))[:, None]
-    lane_points = _stack([scene.lanes.points for scene in scenes], _FAR_M, LANES)
+    lane_points = _stack([scene.lanes.points for scene in scenes], FAR_M, LANES)
     corners = {
         "lanes": lane_points.reshape(*owner.shape, -1),
-        "edges": _stack([scene.edges for scene in scenes], _FAR_M, EDGES),
-        "crossings": _stack([scene.crossings for scene in scenes], _FAR_M, CROSSINGS),
-        "lights": _stack([scene.lights.point for scene in scenes], _FAR_M, num_lights),
+        "edges": _stack([scene.edges for scene in scenes], FAR_M, EDGES),
+        "crossings": _stack([scene.crossings for scene in scenes], FAR_M, CROSSINGS),
+        "lights": _stack([scene.lights.point for scene in scenes], FAR_M, num_lights),
     }
     points = {name: _to_complex(array)[rows] for name, array in corners.items()}
-    beyond = np.full((ROUTE, 2), _FAR_M)  # a route shows as many points at its end as anywhere
-    route_xy = _stack([np.concatenate([route.points, beyond]) for route in routes], _FAR_M, ROUTE)
+    beyond = np.full((ROUTE, 2), FAR_M)  # a route shows as many points at its end as anywhere
+    route_xy = _stack([np.concatenate([route.points, beyond]) for route in routes], FAR_M, ROUTE)
     route_points = _to_complex(route_xy)[..., 0]
     route_ground = padded([route.ground for route in routes], route_points.shape)
-    space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), _FAR_M + 0j)
+    space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), FAR_M + 0j)
     middles = {name: array.mean(-1) for name, array in points.items()}
     middles |= {"lanes": points["lanes"][..., SEGMENT_POINTS // 2], "neighbors": space, "route": route_points}
     largest = max(middles, key=lambda name: middles[name].size)
