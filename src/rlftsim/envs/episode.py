@@ -379,7 +379,7 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     tracks = world.motion[episode.world.actors[:, 0]]  # [M, A, 5]
     gap = tracks[..., :2] - motion[:, None, :2]
     # few boxes are in reach of each other
-    meets = find_presence(episode.world, world)[1][episode.world.actors[:, 0], :, -1]
+    meets = find_presence(episode.world, world, 1)[1][episode.world.actors[:, 0], :, 0]
     meets &= np.hypot(gap[..., 0], gap[..., 1]) <= episode.reach_m
     row, other = np.nonzero(meets)
     if not len(row):

@@ -261,7 +261,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     def to_frame(offset):  # without types, which would be read anew at every step
         return offset * rotation if frame == "ego" else offset + position
 
-    is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
+    is_present = find_presence(world, state, HISTORY + 1)[0]  # [B, A, 11]
 
     # 1. Squared distances, infinite where there is nothing to see.
     squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]

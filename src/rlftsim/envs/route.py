@@ -107,14 +107,25 @@ def find_route(scenario: Scenario, agent: int, choice: RouteChoice, num_steps: i
 
 
 def _logged_route(scene: Scene, agent: int) -> Route:
-    """The path along the lanes that fits the logged way best, 8 s after 8 s, and the longest beyond the log's end."""
+    line = trace_lanes(scene, agent)
+    if len(line):
+        return _of_points(scene, agent, line, "logged lanes")
+    logged = scene.logged[agent, CURRENT_STEP:, :3][scene.valid[agent, CURRENT_STEP:]]
+    beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(logged[-1, 2]), np.sin(logged[-1, 2])]
+    return _of_points(scene, agent, np.concatenate([logged[:, :2], logged[-1, :2] + beyond]), "logged way")
+
+
+def trace_lanes(scene: Scene, agent: int) -> Float[np.ndarray, "n 2"]:
+    """Points 1 m apart along the lanes that fit the logged way best, and straight on; none where no lane is.
+
+    Args:
+        scene: Scene with lanes and log. A scene of more than 8 s is traced 8 s after 8 s.
+        agent: Row of the agent.
+    """
     driver = CurrentAgent.from_track(scene.scenario, int(scene.scenario.simulated_indices[agent]))
     path = _find_path(scene, agent, driver.pose, driver.speed_mps, CURRENT_STEP)
     if path is None:
-        logged_path = scene.logged[agent, CURRENT_STEP:, :2][scene.valid[agent, CURRENT_STEP:]]
-        heading = scene.logged[agent, CURRENT_STEP:, 2][scene.valid[agent, CURRENT_STEP:]][-1]
-        beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(heading), np.sin(heading)]
-        return _of_points(scene, agent, np.concatenate([logged_path, logged_path[-1] + beyond]), "logged way")
+        return np.zeros((0, 2))
     pieces = []
     for start in range(CURRENT_STEP + FUTURE_STEPS, scene.num_steps - 1, FUTURE_STEPS):
         join = len(path.points) - 1
@@ -127,8 +138,7 @@ def _logged_route(scene: Scene, agent: int) -> Route:
             break
         pieces.append(path.points[:join])
         path = following
-    points = np.concatenate([*pieces, path.points])[:, :2]
-    return _of_points(scene, agent, points - scene.scenario.origin, "logged lanes")
+    return np.concatenate([*pieces, path.points])[:, :2] - scene.scenario.origin
 
 
 def _find_path(scene: Scene, agent: int, pose: Pose, speed_mps: float, start: int) -> LanePath | None:

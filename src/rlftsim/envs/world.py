@@ -82,8 +82,8 @@ class World:
     sumo_scenes: tuple[SumoScene, ...]
     """Of each scene where SUMO drives the others; else empty."""
     is_present: Bool[np.ndarray, "B A S"]
-    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends. What
-    SUMO has let leave is in `find_presence`."""
+    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends. Those
+    that have left since are in `WorldState.has_left`."""
     is_observed: Bool[np.ndarray, "B A S"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
@@ -134,6 +134,8 @@ class WorldState:
     """Distance along the line, and speed, of the IDM-driven agents of each scene."""
     sumo_states: tuple[SumoState, ...] = ()
     """Of each scene where SUMO drives the others."""
+    has_left: tuple[Bool[np.ndarray, "B A"], ...] = ()
+    """True = the agent is not there any more, at the same steps as `track`; empty where nobody leaves."""
 
     @property
     def step(self) -> int:
@@ -254,7 +256,9 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     track = tuple(world.logged_steps[: CURRENT_STEP + 1].copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
     sumo_states = tuple(begin_sumo(sumo_scene, scene) for sumo_scene, scene in zip(world.sumo_scenes, world.scenes))
-    return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states)
+    leaves = bool(world.sumo_scenes) or any(np.isfinite(lines.exit_m).any() for lines in world.lines)
+    has_left = (np.zeros(world.mask.shape, bool),) * (len(track) if leaves else 0)
+    return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states, has_left)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
@@ -291,7 +295,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     if len(driven[0]):
         motion[driven] = previous[driven]
         motion[(*driven, slice(3, 5))] = 0.0  # parked ones stay; those with a line move below
-        present = world.is_present[:, :, following - 1]
+        present = find_presence(world, state, 1)[0][..., 0]
         moved_states = []
         for b, (scene, lines) in enumerate(zip(world.scenes, world.lines)):
             agents = b, slice(len(scene.object_id))
@@ -309,18 +313,36 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     # 4. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
-    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, idm_states, tuple(sumo_states))
+    # 5. those that have left
+    has_left = state.has_left
+    if has_left:
+        left = has_left[-1].copy()
+        for b, (lines, idm_state) in enumerate(zip(world.lines, idm_states)):
+            left[b, lines.agents] |= idm_state[:, 0] >= lines.exit_m
+        for b, sumo_state in enumerate(sumo_states):
+            left[b, : len(sumo_state.has_left)] |= sumo_state.has_left
+        has_left = (*has_left, left)
+    track, heights = (*state.track, motion), (*state.z, z)
+    return WorldState(track, heights, block, state.noise, dice, idm_states, tuple(sumo_states), has_left)
 
 
-def find_presence(world: World, state: WorldState) -> tuple[Bool[np.ndarray, "B A T"], Bool[np.ndarray, "B A T"]]:
-    """`is_present` and `is_observed` at the T steps of the log's time up to the present one."""
-    num_steps = len(state.track)
-    present, observed = world.is_present[..., :num_steps], world.is_observed[..., :num_steps]
-    if not state.sumo_states:
+def find_presence(
+    world: World, state: WorldState, num_steps: int | None = None
+) -> tuple[Bool[np.ndarray, "B A T"], Bool[np.ndarray, "B A T"]]:
+    """`is_present` and `is_observed` at the last T steps of the log's time up to the present one.
+
+    Args:
+        world: Scenes that step together.
+        state: Present state of the world.
+        num_steps: Number T of steps; None = all since the first of the log.
+    """
+    end = len(state.track)
+    steps = slice(0 if num_steps is None else end - num_steps, end)
+    present, observed = world.is_present[..., steps], world.is_observed[..., steps]
+    if not state.has_left:
         return present, observed
-    last_step = padded([sumo_state.last_step for sumo_state in state.sumo_states], present.shape[:2], 0)
-    is_left = np.arange(num_steps) > last_step[..., None]
-    return present & ~is_left, observed & ~is_left
+    has_left = np.stack(state.has_left[steps], -1)
+    return present & ~has_left, observed & ~has_left
 
 
 def find_lights(world: World, state: WorldState) -> list[Lights]:
