@@ -221,8 +221,8 @@ def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
     if scene.num_steps > TOTAL_STEPS:
         lane_points = trace_lanes(scene, agent)
         distance = np.linalg.norm(lane_points - poses[-1, :2], axis=1)
-        if distance.min(initial=np.inf) <= NEAR_LANE_M:
-            lane_points = lane_points[int(distance.argmin()) + JOIN_M :]
+        is_on_lane = distance.min(initial=np.inf) <= NEAR_LANE_M
+        lane_points = lane_points[int(distance.argmin()) + JOIN_M :] if is_on_lane else lane_points[:0]
         if len(lane_points) > 1:
             poses = np.vstack([poses, np.column_stack([lane_points, compute_headings(lane_points)])])
             direction = poses[-1, 2]

@@ -117,7 +117,7 @@ class Atlas:
     """States and ages of the lights in the log; the last light is none, far away."""
     agent_facts: Float32[np.ndarray, "B A 3"]
     """Length, width, class."""
-    log_age_s: Float32[np.ndarray, "91 B A"]
+    log_age_s: Float32[np.ndarray, "S B A"]
     """Age of the last logged state of replayed agents."""
     routes: tuple[Route, ...]
     route_points: Complex[np.ndarray, "M r"]

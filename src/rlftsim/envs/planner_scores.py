@@ -350,7 +350,7 @@ def _smooth(
 ) -> Float[np.ndarray, "t *c"]:
     """Derivative of values over the steps by the Savitzky-Golay filter."""
     if len(values) > TOTAL_STEPS:  # a matrix of so many steps squared would not pay
-        return savgol_filter(values, window, order, deriv=derivative, delta=STEP_S, axis=0)
+        return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=STEP_S, axis=0))
     return _build_filter(len(values), window, order, derivative) @ values
 
 
