@@ -165,7 +165,7 @@ def test_the_route_follows_a_long_log_and_the_lanes_beyond_it(long_logs):
 
 
 def test_idm_traffic_follows_the_lanes_beyond_its_log_and_leaves_at_their_end(policy):
-    follower = Mover(x_m=12.0, y_m=0.8, speed_mps=4.0, turn_rate_radps=4.0 / 90.0)
+    follower = Mover(x_m=12.0, y_m=0.8, heading_rad=0.13, speed_mps=4.0, turn_rate_radps=4.0 / 90.0)
     scenario = build_scenario("bend", (Mover(speed_mps=0.0), follower), bend_map())
     result = driven(scenario, "constant_velocity", policy=policy, traffic="idm", max_steps=300)
     record = result.record
