@@ -204,7 +204,7 @@ def unchecked():
         ({"stop_on": ("rain",)}, 0, "stop_on must be one of"),
         ({"stop_on": "collision"}, 0, "stop_on must be one of .* in a list, got .collision."),
         ({"policy": "demo-base"}, 0, "not a policy: name a stored one as `model`"),
-        ({"max_steps": 200}, 0, "max_steps"),
+        ({"max_steps": 0}, 0, "max_steps"),
         ({"colour": 1}, 0, "no setting 'colour'"),
     ],
 )  # fmt: skip

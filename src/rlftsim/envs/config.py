@@ -17,6 +17,7 @@ from rlftsim.scenario.types import FUTURE_STEPS
 StopReason = Literal["collision", "offroad", "goal"]
 ObservationFormat = Literal["dict", "flat", "arrays"]
 RenderMode = Literal["rgb_array", "html"]
+MAX_STEPS = 36_000
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class EnvConfig:
     stop_on: tuple[StopReason, ...] = ("collision",)
     """Events of the planner's agent that end its episode."""
     max_steps: int = FUTURE_STEPS
-    """Length of an episode, at most 80 steps of 0.1 s."""
+    """Length of an episode in steps of 0.1 s; later than second 8 it ends where the map does."""
     route: RouteChoice = "logged"
     """"logged" (the lanes that the logged ego drove), "none", a maneuver, or lane ids."""
     temperature: float = 1.0
@@ -64,8 +65,8 @@ class EnvConfig:
         if not isinstance(self.drivers, Mapping):
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
         parse_terms(self.reward)
-        if not 1 <= self.max_steps <= FUTURE_STEPS:
-            raise ConfigError(f"max_steps must lie between 1 and {FUTURE_STEPS}, got {self.max_steps}.")
+        if not 1 <= self.max_steps <= MAX_STEPS:
+            raise ConfigError(f"max_steps must lie between 1 and {MAX_STEPS}, an hour, got {self.max_steps}.")
 
     @property
     def sampling(self) -> Sampling:

@@ -101,7 +101,7 @@ class StepView:
         """Rows of the agents that are there, near and not yet touched."""
         scene, agent = self.index
         world, motion = self.episode.world, self.state.world.motion[scene]
-        counts = find_presence(world, self.state.world)[1][scene, :, -1] & ~self.state.touched[self.row]
+        counts = find_presence(world, self.state.world, 1)[1][scene, :, 0] & ~self.state.touched[self.row]
         counts[agent] = False
         return np.flatnonzero(counts & (np.abs(motion[:, :2] - motion[agent, :2]).max(1) < reach_m))
 
@@ -206,7 +206,7 @@ class RedLight:
         scene, agent = view.index
         world = view.episode.world
         lights = find_lights(world, view.state.world)[scene]
-        if find_signals(world.scenes[scene].scenario) is None:
+        if find_signals(world.scenes[scene].scenario, world.scenes[scene].num_steps) is None:
             return NEVER
         driven = np.stack([m[scene, agent, :2] for m in view.state.world.track[CURRENT_STEP:]])
         if passes_red_light(replace(world.scenes[scene], lights=lights), driven):

@@ -52,7 +52,7 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         environments[0].source.scenario(scenario_id)
     common_settings = {
         "planner": config.planner, "dataset": config.data, "split": config.split, "num_rollouts": config.num_rollouts,
-        "seed": config.seed, "rlftsim_version": rlftsim.__version__,
+        "seed": config.seed, "seconds": float(config.seconds), "rlftsim_version": rlftsim.__version__,
         "planner_code": hash_code(config.planner),
         "manifest_sha256": hash_manifest(dataset_folder(config.data)),
     }  # fmt: skip

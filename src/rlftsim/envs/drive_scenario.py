@@ -24,7 +24,7 @@ from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_real
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, EpisodeFailure, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED, DriveResult, find_failures, is_failure, rank_scenarios
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenario, count_steps
 from rlftsim.statistics import mean_interval
 from rlftsim.viewer.film import to_film
 
@@ -49,6 +49,8 @@ class DriveConfig:
     num_rollouts: int = 1
     """Episodes of each scenario, with dice of their own."""
     seed: int = 0
+    seconds: float = 8.0
+    """Length of the episodes."""
     limit: int | None = None
     """Only the first so many scenarios."""
     scenarios: tuple[str, ...] | None = None
@@ -62,6 +64,7 @@ class DriveConfig:
         for name in ("num_rollouts", "jobs"):
             whole_number(name, getattr(self, name), 1)
         whole_number("seed", self.seed, 0)
+        count_steps(self.seconds)
         check_choice(self.scenarios, self.limit)
         for traffic in self.traffic or ("",):
             if traffic not in TRAFFIC:
@@ -75,7 +78,7 @@ class DriveConfig:
         """Settings of the environment for a type of traffic: no event ends an episode, and no reward is given."""
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic), stop_on=(),
-            reward="none", **read_action_settings(load_planner(self.planner)),
+            reward="none", max_steps=count_steps(self.seconds), **read_action_settings(load_planner(self.planner)),
         )  # fmt: skip
 
     def count_side_by_side(self, traffic: str, num_scenarios: int) -> int:

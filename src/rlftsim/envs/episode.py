@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from rlftsim.envs.actions import Actors, Controls, validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, classify_collision
-from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
+from rlftsim.envs.observations import FAR_M, Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
 from rlftsim.envs.route import SPACING_M, find_route
@@ -23,11 +23,14 @@ from rlftsim.envs.world import Dice, World, WorldState, begin, find_presence, st
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.goals.types import PointById
 from rlftsim.realism.map_based import RoadEdges, compute_point_distance_to_road_edge, join_road_edges
+from rlftsim.scenario.types import FUTURE_STEPS
 from rlftsim.viewer.scene import SIMPLIFY_TOLERANCE_M
 
 AT_GOAL_M = 2.0
 SIMPLIFIED_M = 2 * SIMPLIFY_TOLERANCE_M
 """The edges of the observations are nearer to the logged ones than this."""
+MAP_END_M = 30.0
+"""The map has ended where no lane and no road edge is as near as this."""
 ScenarioGoals = Mapping[str, PointById]
 """Scenario id -> object id -> (x, y), world frame, m."""
 
@@ -124,7 +127,10 @@ def build_episode(world: World, controls: Controls, config: EnvConfig, goals: Sc
     """
     routes = tuple(
         find_route(
-            world.scenes[scene].scenario, int(agent), config.route if agent == world.scenes[scene].ego else "logged"
+            world.scenes[scene].scenario,
+            int(agent),
+            config.route if agent == world.scenes[scene].ego else "logged",
+            world.scenes[scene].num_steps,
         )
         for scene, agent in world.actors
     )
@@ -231,6 +237,8 @@ def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
 def _with_ends(episode: Episode, state: EpisodeState) -> tuple[EpisodeState, Bool[np.ndarray, "M"]]:
     """The same state, with marks for the agents whose episode ends here, and True for those that an event stops."""
     is_over, stopped = state.world.step >= episode.config.max_steps, _stopped(episode, state)
+    if state.world.step > FUTURE_STEPS:
+        is_over |= has_left_map(episode, state.world)
     return replace(state, ended=state.ended | stopped | is_over), stopped
 
 
@@ -302,6 +310,22 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
     return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
 
 
+def has_left_map(episode: Episode, world: WorldState) -> Bool[np.ndarray, "M"]:
+    """True where a planner-driven agent is beyond the end of the map, where no score means anything.
+
+    Args:
+        episode: Episode with the constant world, map and settings.
+        world: State of the episode's scenes, at any step.
+    """
+    atlas, motion = episode.atlas, own_motion(episode, world)
+    distances = [
+        np.hypot(atlas.x[:, columns] - motion[:, :1], atlas.y[:, columns] - motion[:, 1:2]).min(1)
+        for columns in (atlas.columns["lanes"], atlas.columns["edges"])
+    ]
+    nearest = np.minimum(*distances)
+    return (nearest > MAP_END_M) & (nearest < FAR_M / 2)  # without a map there is only padding
+
+
 def _ground(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
     """Height of the ground under planner-driven agents: the undersides of the boxes."""
     scene, agent = episode.world.actors[rows].T
@@ -355,7 +379,7 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     tracks = world.motion[episode.world.actors[:, 0]]  # [M, A, 5]
     gap = tracks[..., :2] - motion[:, None, :2]
     # few boxes are in reach of each other
-    meets = find_presence(episode.world, world)[1][episode.world.actors[:, 0], :, -1]
+    meets = find_presence(episode.world, world, 1)[1][episode.world.actors[:, 0], :, 0]
     meets &= np.hypot(gap[..., 0], gap[..., 1]) <= episode.reach_m
     row, other = np.nonzero(meets)
     if not len(row):

@@ -101,7 +101,7 @@ class TrafficLog:
         if begun in self.steps:
             return
         with torch.no_grad():
-            distribution = world.policy.decide(world.context, block.policy_state)
+            distribution = world.policy.decide(block.context, block.policy_state)
             log_prob = distribution.log_prob(block.decision, world.sampling)[:, 0].double().cpu().numpy()
         self.steps.append(begun)
         self.log_prob.append(np.where(world.drivers == Driver.POLICY, log_prob, 0.0).sum(1))

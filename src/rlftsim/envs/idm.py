@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from rlftsim.envs.actions import signed_speed, to_heading_frame
 from rlftsim.envs.levels import RouteHeights, is_on_level
-from rlftsim.envs.route import compute_headings, sample_line
+from rlftsim.envs.route import NEAR_LANE_M, compute_headings, sample_line, trace_lanes
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.polylines import arc_length, resample_to
@@ -23,6 +23,8 @@ ON_LINE_M = 2.0
 """A light whose stop point is within this distance of a line is on the line."""
 BEYOND_M = 60.0
 """A line goes straight on so far beyond the logged way."""
+JOIN_M = 5
+"""A way goes on along the lanes so far ahead of its end."""
 PARKED_MPS = 0.5
 """A vehicle that is never faster in its log stays parked."""
 NEAREST, BEYOND_BOX_M = 16, 10.0
@@ -164,6 +166,8 @@ class IdmLines:
     """Distance along the line to the stop point of each light; infinite where the light is on another way."""
     wanted_mps: Float[np.ndarray, "M"]
     """The fastest logged speed, at least that of `IdmConfig` unless the agent backs up."""
+    exit_m: Float[np.ndarray, "M"]
+    """Distance along the line where the agent leaves, beyond the lanes; infinite in scenes of 8 s."""
 
 
 def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
@@ -176,7 +180,8 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
     """
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
-    sampled = [_sample_path(_logged_path(scene, int(agent))) for agent in agents]
+    paths = [_logged_path(scene, int(agent)) for agent in agents]
+    sampled = [_sample_path(path) for path in paths]
     longest = max((len(line) for line, _ in sampled), default=1)
     shape = (len(agents), longest)
     points, heading, backs_up = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape, bool)
@@ -196,12 +201,15 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
         offset[~is_on_level(scene.lights.z - ground[..., None])] = np.inf
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
     facing = np.where(backs_up, wrapped(heading + np.pi), heading)
-    return IdmLines(agents, points, heading, facing, turn_m, ground, stop, free_speed)
+    exit_m = np.full(len(agents), np.inf)
+    if scene.num_steps > TOTAL_STEPS:
+        exit_m = np.array([arc_length(path[:, :2])[-2 if len(path) > 2 else -1] - 2.0 for path in paths])
+    return IdmLines(agents, points, heading, facing, turn_m, ground, stop, free_speed, exit_m)
 
 
 def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
-    """Poses of an agent's log where the agent moves, and a last pose straight on."""
-    logged = scene.logged[agent, CURRENT_STEP:TOTAL_STEPS]
+    """Poses of an agent's log where the agent moves, further lanes in a scene of more than 8 s, and a last pose."""
+    logged = scene.logged[agent, CURRENT_STEP:]
     step = np.linalg.norm(np.diff(logged[:, :2], axis=0), axis=1)
     poses = logged[np.append(True, step > 0.05), :3]
     direction = logged[0, 2] + (np.pi if signed_speed(logged[:1])[0] < 0 else 0.0)
@@ -210,6 +218,14 @@ def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
         direction = np.arctan2(last[1], last[0])
     else:
         poses = poses[:1]
+    if scene.num_steps > TOTAL_STEPS:
+        lane_points = trace_lanes(scene, agent)
+        distance = np.linalg.norm(lane_points - poses[-1, :2], axis=1)
+        is_on_lane = distance.min(initial=np.inf) <= NEAR_LANE_M
+        lane_points = lane_points[int(distance.argmin()) + JOIN_M :] if is_on_lane else lane_points[:0]
+        if len(lane_points) > 1:
+            poses = np.vstack([poses, np.column_stack([lane_points, compute_headings(lane_points)])])
+            direction = poses[-1, 2]
     beyond = poses[-1] + BEYOND_M * np.array([np.cos(direction), np.sin(direction), 0.0])
     return np.vstack([poses, beyond])
 
@@ -303,7 +319,7 @@ def advance_idm(
     gap, lead = find_leaders(line, heading, size[lines.agents], motion[nearest], size[nearest], mask)
     # 2. A red or yellow light ahead is a standing leader.
     front = position_m + size[lines.agents, 0] / 2
-    waits = np.isin(scene.lights.state[min(step, TOTAL_STEPS - 1)], (RED, YELLOW))
+    waits = np.isin(scene.lights.state[step], (RED, YELLOW))
     to_stop = np.where(waits & (lines.stop_m >= front[:, None]), lines.stop_m - front[:, None], np.inf)
     to_stop = to_stop.min(1, initial=np.inf)
     lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)

@@ -21,7 +21,7 @@ from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW, Lights
 from rlftsim.envs.world import World, WorldState, find_lights, find_presence, padded
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import heights_overlap, wrapped
-from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
+from rlftsim.scenario.types import STEP_S
 
 Frame = Literal["ego", "world"]
 
@@ -33,7 +33,8 @@ BOUND = 1e4
 HISTORY = 10
 OWN_LANES = 12
 """Nearest pieces that an agent's own lane is searched among."""
-_FAR_M = 1e7
+FAR_M = 1e7
+"""Coordinate of padding."""
 _ROW_BITS = (1 << 24) - 1
 _SEEN_KEY = int(np.float64(SEEN_M * SEEN_M).view(np.int64)) | _ROW_BITS
 _COLORS = np.array([RED, YELLOW, GREEN])
@@ -112,11 +113,11 @@ class Atlas:
     """Space for points, class, speed limit, space for the light, on the route, stop sign."""
     lane_light: Int64[np.ndarray, "M n"]
     """Index of the light among those of all agents; an agent's last one is none."""
-    lights: tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]
+    lights: tuple[Int64[np.ndarray, "S B T1"], Float[np.ndarray, "S B T1"]]
     """States and ages of the lights in the log; the last light is none, far away."""
     agent_facts: Float32[np.ndarray, "B A 3"]
     """Length, width, class."""
-    log_age_s: Float32[np.ndarray, "91 B A"]
+    log_age_s: Float32[np.ndarray, "S B A"]
     """Age of the last logged state of replayed agents."""
     routes: tuple[Route, ...]
     route_points: Complex[np.ndarray, "M r"]
@@ -156,19 +157,19 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         lane_rows[row, :, -2] = np.isin(owner[rows[row]], route.lanes)
     lane_light = [np.where(s.lanes.light < 0, num_lights - 1, s.lanes.light) for s in scenes]
     lane_light = _stack(lane_light, num_lights - 1, LANES)[rows] + num_lights * np.arange(len(rows))[:, None]
-    lane_points = _stack([scene.lanes.points for scene in scenes], _FAR_M, LANES)
+    lane_points = _stack([scene.lanes.points for scene in scenes], FAR_M, LANES)
     corners = {
         "lanes": lane_points.reshape(*owner.shape, -1),
-        "edges": _stack([scene.edges for scene in scenes], _FAR_M, EDGES),
-        "crossings": _stack([scene.crossings for scene in scenes], _FAR_M, CROSSINGS),
-        "lights": _stack([scene.lights.point for scene in scenes], _FAR_M, num_lights),
+        "edges": _stack([scene.edges for scene in scenes], FAR_M, EDGES),
+        "crossings": _stack([scene.crossings for scene in scenes], FAR_M, CROSSINGS),
+        "lights": _stack([scene.lights.point for scene in scenes], FAR_M, num_lights),
     }
     points = {name: _to_complex(array)[rows] for name, array in corners.items()}
-    beyond = np.full((ROUTE, 2), _FAR_M)  # a route shows as many points at its end as anywhere
-    route_xy = _stack([np.concatenate([route.points, beyond]) for route in routes], _FAR_M, ROUTE)
+    beyond = np.full((ROUTE, 2), FAR_M)  # a route shows as many points at its end as anywhere
+    route_xy = _stack([np.concatenate([route.points, beyond]) for route in routes], FAR_M, ROUTE)
     route_points = _to_complex(route_xy)[..., 0]
     route_ground = padded([route.ground for route in routes], route_points.shape)
-    space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), _FAR_M + 0j)
+    space = np.full((len(rows), max(world.mask.shape[1], NEIGHBORS + 1)), FAR_M + 0j)
     middles = {name: array.mean(-1) for name, array in points.items()}
     middles |= {"lanes": points["lanes"][..., SEGMENT_POINTS // 2], "neighbors": space, "route": route_points}
     largest = max(middles, key=lambda name: middles[name].size)
@@ -193,9 +194,10 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
             middle = middles[name]
             padded_z = padded(z, (len(scenes), middle.shape[1]))[rows]
             heights[name] = RouteHeights.measure(middle[..., None].view(np.float64), padded_z, route_xy, route_ground)
-    last_logged = np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2)
+    steps = np.arange(world.valid.shape[2])
+    last_logged = np.maximum.accumulate(np.where(world.valid, steps, 0), axis=2)
     # replayed agents alone have a log to go by
-    age = np.where((world.drivers == Driver.REPLAY)[..., None], STEP_S * (np.arange(TOTAL_STEPS) - last_logged), 0.0)
+    age = np.where((world.drivers == Driver.REPLAY)[..., None], STEP_S * (steps - last_logged), 0.0)
     return Atlas(
         x=np.concatenate([np.real(middle) for middle in middles.values()], 1),
         y=np.concatenate([np.imag(middle) for middle in middles.values()], 1),
@@ -231,9 +233,9 @@ def _to_complex(points: Float[np.ndarray, "*n c"]) -> Complex[np.ndarray, "*n p"
 
 def _stack_lights(
     lights: Sequence[Lights], count: int
-) -> tuple[Int64[np.ndarray, "91 B T1"], Float[np.ndarray, "91 B T1"]]:
+) -> tuple[Int64[np.ndarray, "S B T1"], Float[np.ndarray, "S B T1"]]:
     """States and ages of the lights of each scene, padded with lights that are none."""
-    shape = len(lights), count, TOTAL_STEPS
+    shape = len(lights), count, len(lights[0].state)
     states, ages = padded([s.state.T for s in lights], shape, 0), padded([s.age_s.T for s in lights], shape)
     return np.moveaxis(states, 2, 0), np.moveaxis(ages, 2, 0)
 
@@ -259,7 +261,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     def to_frame(offset):  # without types, which would be read anew at every step
         return offset * rotation if frame == "ego" else offset + position
 
-    is_present = find_presence(world, state)[0][..., log_step - HISTORY :]  # [B, A, 11]
+    is_present = find_presence(world, state, HISTORY + 1)[0]  # [B, A, 11]
 
     # 1. Squared distances, infinite where there is nothing to see.
     squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]

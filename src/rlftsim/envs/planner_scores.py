@@ -6,7 +6,7 @@ edges and center lines but no lane polygons, hence the suffix `_style`: "inside 
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -22,7 +22,16 @@ from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario, cached_on_scenario
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    FUTURE_STEPS,
+    HISTORY_STEPS,
+    STEP_S,
+    TOTAL_STEPS,
+    ObjectType,
+    Scenario,
+    cached_on_scenario,
+)
 
 PROGRESS_M = 2.0
 """Least progress that counts as one: 2 m in nuPlan's code and configuration, 0.1 m in the text of its documents."""
@@ -98,7 +107,7 @@ def score_planner(record: Record) -> PlannerScores:
     jerk = kinematics.jerk
     collisions, faults = record.collisions, [collision.at_fault for collision in record.collisions]
     route_length_m = float(record.route.progress(record.route.points[-1:])[0]) if len(record.route) else math.nan
-    return PlannerScores(
+    scores = PlannerScores(
         nuplan_style=nuplan * _weighted(components, WEIGHTS),
         pdms_style=pdms * _weighted(early_components, PDMS_WEIGHTS),
         **components,
@@ -107,21 +116,30 @@ def score_planner(record: Record) -> PlannerScores:
         hit_rate=float(not all(faults)),
         red_light_rate=float(passes_red_light(record.scene, record.agent_motion[:, :2])),
         least_ttc_s=float(steps.time_to_collision_s.min()),
-        off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(steps.off_road_m.max())),
+        off_road_m=max(0.0, float(steps.off_road_m.max())),
         route_completion=_gained(record.route, record.agent_motion) / route_length_m if route_length_m else math.nan,
         speed_change_mps=max((collision.speed_change_mps for collision in collisions), default=0.0),
         mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
         jerk_95_mps3=float(np.quantile(jerk, 0.95)) if len(jerk) else math.nan,
         displacement_error=_displacement(record),
     )
+    return replace(scores, **{name: math.nan for name in asdict(scores).keys() & missing})
 
 
 def missing_scores(record: Record) -> dict[str, str]:
     """Scores that cannot be measured in a record's scenario, and why."""
-    reasons = {}
+    reasons, log_steps = {}, record.scene.scenario.num_steps - HISTORY_STEPS
+    if record.steps > FUTURE_STEPS:
+        reasons["others_realism"] = f"the metric compares {FUTURE_STEPS * STEP_S:g} s"
+    if record.steps > FUTURE_STEPS and record.has_left_map:
+        reasons[f"score after {record.steps * STEP_S:.1f} s"] = "the map ends there"
     if not record.scene.scenario.has_future:
         reason = "the log's future is withheld, as in a test split"
         reasons |= dict.fromkeys(("progress", "making_progress", "displacement_error"), reason)
+    elif record.steps > max(FUTURE_STEPS, log_steps):
+        names = ["progress", "making_progress", "displacement_error"]
+        names += ["red_light_rate"] * (len(record.scene.scenario.lights.step) > 0)
+        reasons |= dict.fromkeys(names, f"the log ends after {log_steps * STEP_S:.1f} s")
     elif not len(record.logged_route):
         reasons |= dict.fromkeys(("progress", "making_progress"), "there is no lane to measure progress along")
     if lane_search(record.scene.scenario) is None:
@@ -333,6 +351,8 @@ def _smooth(
     values: Float[np.ndarray, "t *c"], window: int, *, order: int, derivative: int
 ) -> Float[np.ndarray, "t *c"]:
     """Derivative of values over the steps by the Savitzky-Golay filter."""
+    if len(values) > TOTAL_STEPS:  # a matrix of so many steps squared would not pay
+        return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=STEP_S, axis=0))
     return _build_filter(len(values), window, order, derivative) @ values
 
 
@@ -353,9 +373,14 @@ def _comfort(motion: _Kinematics) -> float:
 
 
 @cached_on_scenario
-def find_signals(scenario: Scenario) -> Signals | None:
-    """Traffic lights of a scenario, with the lanes that they are on; None without any."""
-    return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
+def find_signals(scenario: Scenario, num_steps: int) -> Signals | None:
+    """Traffic lights of a scenario, with the lanes that they are on; None without any.
+
+    Args:
+        scenario: Scenario with the map and the logged lights.
+        num_steps: Number of steps of the log's time; lights that are not logged are not red.
+    """
+    return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"), num_steps)
 
 
 def passes_red_light(scene: Scene, driven: Float[np.ndarray, "T1 2"]) -> bool:
@@ -366,11 +391,12 @@ def passes_red_light(scene: Scene, driven: Float[np.ndarray, "T1 2"]) -> bool:
         driven: Positions [T + 1, 2] of the agent from the current step on, map frame, m.
     """
     scenario, num_steps = scene.scenario, len(driven) - 1
-    signals = find_signals(scenario)
+    signals = find_signals(scenario, scene.num_steps)
     if signals is None or not num_steps:
         return False
-    if scene.lights is not build_env_scene(scenario).lights:  # as SUMO showed them
-        signals = build_signals(scenario.map_features, scene.lights.log(scenario.lights), torch.device("cpu"))
+    if scene.lights is not build_env_scene(scenario, scene.num_steps).lights:  # as SUMO showed them
+        lights = scene.lights.log(scenario.lights)
+        signals = build_signals(scenario.map_features, lights, torch.device("cpu"), scene.num_steps)
         assert signals is not None
     x, y = torch.from_numpy(driven + scenario.origin).float().T[:, None, None]
     valid = torch.ones(1, 1, num_steps, dtype=torch.bool)

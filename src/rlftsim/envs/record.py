@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.envs.contact import Collision
-from rlftsim.envs.episode import Episode, EpisodeState
+from rlftsim.envs.episode import Episode, EpisodeState, has_left_map
 from rlftsim.envs.route import Route, find_route
 from rlftsim.envs.scene import Scene
 from rlftsim.envs.world import find_lights, find_presence
@@ -35,6 +35,8 @@ class Record:
     """Route that the planner sees."""
     logged_route: Route
     """Lanes that the logged agent drove, along which progress is measured."""
+    has_left_map: bool
+    """True = the planner's agent is beyond the end of the map."""
     traffic: str
     """Driver of the other agents: name of the model, or type of traffic."""
 
@@ -100,6 +102,7 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         is_observed=is_observed,
         collisions=state.collisions[row],
         route=episode.atlas.routes[row],
-        logged_route=find_route(scene.scenario, agent, "logged"),
+        logged_route=find_route(scene.scenario, agent, "logged", scene.num_steps),
+        has_left_map=bool(has_left_map(episode, state.world)[row]),
         traffic=episode.config.model if episode.config.traffic == "policy" else episode.config.traffic,
     )

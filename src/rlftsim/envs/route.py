@@ -13,17 +13,28 @@ from rlftsim.envs.levels import is_on_level
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import wrapped
-from rlftsim.goals.lane_paths import MAX_LANE_DISTANCE_M, LanePath, lane_change_paths, lanes_for
-from rlftsim.goals.proposals import CurrentAgent, own_paths, propose_from_lanes
+from rlftsim.goals.lane_paths import (
+    MAX_LANE_DISTANCE_M,
+    LanePath,
+    Pose,
+    ease_m,
+    lane_change_paths,
+    lanes_for,
+    own_lanes,
+    paths_from,
+)
+from rlftsim.goals.proposals import CurrentAgent, propose_from_lanes
 from rlftsim.scenario.lane_graph import LaneGraph
 from rlftsim.scenario.polylines import arc_length
-from rlftsim.scenario.types import CURRENT_STEP, Scenario, cached_on_scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, ObjectType, Scenario, cached_on_scenario
 
 SPACING_M = 2.0
 BEYOND_M = 50.0
 """Length of a route beyond the end of the logged way."""
 LEAST_M = 100.0
 """Least length of a route, where the lanes go on so far."""
+ON_M = 240.0
+"""Least length of each later 8 s of a route, 30 m/s."""
 NEAR_LANE_M, ALONG_RAD = 4.0, np.radians(60.0)
 """A point of a route is on the nearest lane within this distance that runs its way."""
 TURN_PENALTY = 0.02
@@ -65,18 +76,19 @@ NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zer
 
 
 @cached_on_scenario
-def find_route(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
+def find_route(scenario: Scenario, agent: int, choice: RouteChoice, num_steps: int = TOTAL_STEPS) -> Route:
     """Route of an agent; empty without lanes.
 
     Args:
         scenario: Scenario with lanes and log for the route.
         agent: Row of the agent among the simulated agents.
         choice: Kind of route: "logged" for the lanes of the log, "none", a maneuver that the lanes allow, or lane ids.
+        num_steps: Number of steps of the log's time, beyond the 91 of the metric for an episode that goes on.
 
     Raises:
         ConfigError: no such lane or maneuver.
     """
-    scene = build_env_scene(scenario)
+    scene = build_env_scene(scenario, num_steps)
     if choice == "none" or not len(scene.graph):
         return NO_ROUTE
     if isinstance(choice, tuple):
@@ -95,33 +107,82 @@ def find_route(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
 
 
 def _logged_route(scene: Scene, agent: int) -> Route:
-    """The path along the lanes that fits the logged way best."""
-    logged_path = scene.logged[agent, CURRENT_STEP:, :2][scene.valid[agent, CURRENT_STEP:]]
-    travelled = float(arc_length(logged_path)[-1])
-    paths = _paths(scene.scenario, agent, max(travelled + BEYOND_M, LEAST_M))
-    if not paths:
-        heading = scene.logged[agent, CURRENT_STEP:, 2][scene.valid[agent, CURRENT_STEP:]][-1]
-        beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(heading), np.sin(heading)]
-        return _of_points(scene, agent, np.concatenate([logged_path, logged_path[-1] + beyond]), "logged way")
+    line = trace_lanes(scene, agent)
+    if len(line):
+        return _of_points(scene, agent, line, "logged lanes")
+    logged = scene.logged[agent, CURRENT_STEP:, :3][scene.valid[agent, CURRENT_STEP:]]
+    beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(logged[-1, 2]), np.sin(logged[-1, 2])]
+    return _of_points(scene, agent, np.concatenate([logged[:, :2], logged[-1, :2] + beyond]), "logged way")
+
+
+def trace_lanes(scene: Scene, agent: int) -> Float[np.ndarray, "n 2"]:
+    """Points 1 m apart along the lanes that fit the logged way best, and straight on; none where no lane is.
+
+    Args:
+        scene: Scene with lanes and log. A scene of more than 8 s is traced 8 s after 8 s.
+        agent: Row of the agent.
+    """
+    driver = CurrentAgent.from_track(scene.scenario, int(scene.scenario.simulated_indices[agent]))
+    path = _find_path(scene, agent, driver.pose, driver.speed_mps, CURRENT_STEP)
+    if path is None:
+        return np.zeros((0, 2))
+    pieces = []
+    for start in range(CURRENT_STEP + FUTURE_STEPS, scene.num_steps - 1, FUTURE_STEPS):
+        join = len(path.points) - 1
+        if scene.valid[agent, start:].any():
+            position = scene.logged[agent, start, :2] + scene.scenario.origin
+            join = int(np.linalg.norm(path.points[:, :2] - position, axis=1).argmin())
+        speed = float(np.linalg.norm(scene.logged[agent, start, 3:]))
+        following = _find_path(scene, agent, path.pose(join), speed, start)
+        if following is None:
+            break
+        pieces.append(path.points[:join])
+        path = following
+    return np.concatenate([*pieces, path.points])[:, :2] - scene.scenario.origin
+
+
+def _find_path(scene: Scene, agent: int, pose: Pose, speed_mps: float, start: int) -> LanePath | None:
+    """The path along the lanes that fits 8 s of the logged way best; None where no lane is.
+
+    Args:
+        scene: Scene with lanes and log.
+        agent: Row of the agent.
+        pose: Pose where the path begins, world frame.
+        speed_mps: Speed there.
+        start: Step of the log at the pose. Beyond the log's end the longest path is taken.
+    """
+    steps = slice(start, start + FUTURE_STEPS + 1)
+    logged_path = scene.logged[agent, steps, :2][scene.valid[agent, steps]]
+    travelled = float(arc_length(logged_path)[-1]) if len(logged_path) else 0.0
+    least_m = LEAST_M if start == CURRENT_STEP else ON_M
+    paths = _find_paths(scene, agent, pose, speed_mps, max(travelled + BEYOND_M, least_m))
+    if not len(logged_path):
+        longest = max((path.length_m for path in paths), default=0.0)
+        paths = [path for path in paths if path.length_m > longest - SPACING_M]
     world = logged_path + scene.scenario.origin
     misfit = [
-        float(np.linalg.norm(world[:, None] - path.points[:, :2], axis=-1).min(1).mean())
+        (float(np.linalg.norm(world[:, None] - path.points[:, :2], axis=-1).min(1).mean()) if len(world) else 0.0)
         + TURN_PENALTY * abs(float(path.turn[-1]))
         for path in paths
     ]
-    best = paths[int(np.argmin(misfit))].points[:, :2] - scene.scenario.origin
-    return _of_points(scene, agent, best, "logged lanes")
+    return paths[int(np.argmin(misfit))] if paths else None
 
 
-def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
-    """Paths along the lanes from an agent's pose, with a lane change and without."""
-    driver = CurrentAgent.from_track(scenario, int(scenario.simulated_indices[agent]))
-    scene = build_env_scene(scenario)
-    lanes = lanes_for(scene.graph, driver.object_type)
+def _find_paths(scene: Scene, agent: int, pose: Pose, speed_mps: float, length_m: float) -> list[LanePath]:
+    """Paths along the lanes from a pose, with a lane change and without.
+
+    Args:
+        scene: Scene with lanes.
+        agent: Row of the agent, whose type decides on the lanes.
+        pose: Pose where the paths begin, world frame.
+        speed_mps: Speed there.
+        length_m: Greatest length of a path, m.
+    """
+    lanes = lanes_for(scene.graph, ObjectType(int(scene.object_type[agent])))
     if scene.levels is not None:
-        lanes.usable[_lanes_of_other_levels(scene.graph, driver.pose.position)] = False
-    lane_paths = own_paths(driver, lanes, length_m=length_m)
-    speed = max(driver.speed_mps, 5.0)
+        lanes.usable[_lanes_of_other_levels(scene.graph, pose.position)] = False
+    lane_paths = paths_from(lanes, pose, own_lanes(lanes, pose), length_m=length_m, ease_m=ease_m(speed_mps))
+    speed = max(speed_mps, 5.0)
     changing = [
         path
         for start in lane_paths

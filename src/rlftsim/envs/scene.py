@@ -56,27 +56,27 @@ class LaneSegments:
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """T traffic lights over the 91 steps of a log. Where the log has no further states, the last state holds."""
+    """T traffic lights over the S steps of an episode. Where the log has no further states, the last state holds."""
 
     point: Float[np.ndarray, "T 2"]
     z: Float[np.ndarray, "T"]
     lane: Int64[np.ndarray, "T"]
     """Index of the controlled lane in the `lane_graph`; -1 = not on the map."""
-    state: Int64[np.ndarray, "91 T"]
-    age_s: Float[np.ndarray, "91 T"]
+    state: Int64[np.ndarray, "S T"]
+    age_s: Float[np.ndarray, "S T"]
     """Time since the state last changed."""
     last_observed: int
     """Last step with an observation; -1 = there is none."""
 
     def log(self, logged: LightStates) -> LightStates:
-        """Observations of the same lights at the same steps, with the states that are here."""
+        """Observations of the same lights at the same steps, with the states that are here, as far as they go."""
         _, column = np.unique(logged.lane_id, return_inverse=True)
-        return replace(logged, state=_STATE_OF_COLOR[self.state[logged.step, column]])
+        return replace(logged, state=_STATE_OF_COLOR[self.state[np.minimum(logged.step, len(self.state) - 1), column]])
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Simulated agents (track order, A), log and map."""
+    """Simulated agents (track order, A), S steps of the log's time, and map."""
 
     scenario: Scenario
     ego: int
@@ -87,12 +87,12 @@ class Scene:
     """Length, width, height at the current step, m."""
     z: Float[np.ndarray, "A"]
     """Height of the center at the current step, m."""
-    logged: Float[np.ndarray, "A 91 5"]
+    logged: Float[np.ndarray, "A S 5"]
     """x, y, heading, vx, vy; where a state is not valid, the last valid pose (the first before it), at rest."""
-    logged_z: Float[np.ndarray, "A 91"]
+    logged_z: Float[np.ndarray, "A S"]
     """Height of the center, likewise."""
-    valid: Bool[np.ndarray, "A 91"]
-    """False beyond the end of a test split's log."""
+    valid: Bool[np.ndarray, "A S"]
+    """False beyond the end of the log."""
     graph: LaneGraph
     """Lanes in the world frame."""
     lanes: LaneSegments
@@ -107,26 +107,36 @@ class Scene:
     levels: Levels | None
     """None = no two roads lie above each other, or heights are guessed: heights do not count."""
 
+    @property
+    def num_steps(self) -> int:
+        """S: 91, or history and "now" and all steps of a longer episode."""
+        return self.valid.shape[1]
+
 
 @cached_on_scenario
-def build_env_scene(scenario: Scenario) -> Scene:
-    """The scenario as arrays."""
+def build_env_scene(scenario: Scenario, num_steps: int = TOTAL_STEPS) -> Scene:
+    """The scenario as arrays.
+
+    Args:
+        scenario: Scenario with a log of any length.
+        num_steps: Number S of steps of the log's time; the log is cut, or held at its end.
+    """
     tracks, rows, graph = scenario.tracks, scenario.simulated_indices, lane_graph(scenario)
-    num_steps = min(scenario.num_steps, TOTAL_STEPS)
-    states = np.zeros((len(rows), TOTAL_STEPS, 6))
-    states[:, :num_steps, :2] = tracks.position[rows, :num_steps, :2].astype(np.float64) - scenario.origin
-    states[:, :num_steps, 2] = tracks.heading[rows, :num_steps]
-    states[:, :num_steps, 3:5] = tracks.velocity[rows, :num_steps]
-    states[:, :num_steps, 5] = tracks.position[rows, :num_steps, 2]
+    steps = slice(min(scenario.num_steps, num_steps))
+    states = np.zeros((len(rows), num_steps, 6))
+    states[:, steps, :2] = tracks.position[rows, steps, :2].astype(np.float64) - scenario.origin
+    states[:, steps, 2] = tracks.heading[rows, steps]
+    states[:, steps, 3:5] = tracks.velocity[rows, steps]
+    states[:, steps, 5] = tracks.position[rows, steps, 2]
     valid = np.zeros(states.shape[:2], bool)
-    valid[:, :num_steps] = tracks.valid[rows, :num_steps]
+    valid[:, steps] = tracks.valid[rows, steps]
     # every state that is not valid takes the last valid one, or before that the first: agents never jump to zeros
-    last_valid = np.maximum.accumulate(np.where(valid, np.arange(TOTAL_STEPS), -1), axis=1)
-    source_step = np.where(last_valid < 0, valid.argmax(1)[:, None], last_valid)  # [A, 91]
+    last_valid = np.maximum.accumulate(np.where(valid, np.arange(num_steps), -1), axis=1)
+    source_step = np.where(last_valid < 0, valid.argmax(1)[:, None], last_valid)  # [A, S]
     states = np.take_along_axis(states, source_step[..., None], axis=1)
     logged, logged_z = states[..., :5].copy(), states[..., 5].copy()
     logged[~valid, 3:] = 0.0
-    lights = _build_lights(scenario, graph)
+    lights = _build_lights(scenario, graph, num_steps)
     lanes = _cut_lanes(scenario, graph, lights)
     size = tracks.size[rows, CURRENT_STEP].astype(np.float64)
     undersides = np.concatenate([logged[..., :2], (logged_z - size[:, 2:] / 2)[..., None]], -1)[valid]
@@ -155,13 +165,13 @@ def build_env_scene(scenario: Scenario) -> Scene:
     )
 
 
-def _build_lights(scenario: Scenario, graph: LaneGraph) -> Lights:
-    is_simulated = scenario.lights.step < TOTAL_STEPS
+def _build_lights(scenario: Scenario, graph: LaneGraph, num_steps: int) -> Lights:
+    is_simulated = scenario.lights.step < num_steps
     log_step, log_state = scenario.lights.step[is_simulated], scenario.lights.state[is_simulated]
     lane_ids, column = np.unique(scenario.lights.lane_id, return_inverse=True)
     point = np.zeros((len(lane_ids), 3))
     point[column] = scenario.lights.stop_point.astype(np.float64) - [*scenario.origin, 0.0]
-    state = np.zeros((TOTAL_STEPS, len(lane_ids)), np.int64)
+    state = np.zeros((num_steps, len(lane_ids)), np.int64)
     observed_step = np.full(state.shape, -1)
     # of several observations of a lane at a step the last one counts, as in the metric
     state[log_step, column[is_simulated]] = _COLOR_OF_STATE[np.clip(log_state, 0, 8)]
@@ -169,7 +179,7 @@ def _build_lights(scenario: Scenario, graph: LaneGraph) -> Lights:
     # a light that is not observed keeps its last state
     last_observed = np.maximum.accumulate(observed_step, axis=0)
     state = np.where(last_observed >= 0, np.take_along_axis(state, np.maximum(last_observed, 0), axis=0), 0)
-    steps = np.arange(TOTAL_STEPS)[:, None]
+    steps = np.arange(num_steps)[:, None]
     is_changed = np.diff(state, axis=0, prepend=state[:1]) != 0
     last_change = np.maximum.accumulate(np.where(is_changed, steps, 0), axis=0)
     row_of_id = {int(lane_id): row for row, lane_id in enumerate(graph.lane_id)}

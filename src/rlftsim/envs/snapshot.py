@@ -22,7 +22,7 @@ from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, DataError, check_types, in_short
 from rlftsim.jobs.documents import parse_json
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, STEP_S
 
 FORMAT = "rlftsim-snapshot-1"
 CHECKSUM_BYTES = 32
@@ -127,8 +127,9 @@ def _check_motion(motion: np.ndarray, episode: Episode) -> None:
     Raises:
         ValueError: A wrong number of steps, another beginning, or a step farther than the speed explains.
     """
-    if not 1 <= len(motion) <= FUTURE_STEPS + 1:
-        raise ValueError(f"its motion has {len(motion) - 1} steps, not 0 to {FUTURE_STEPS}")
+    max_steps = episode.world.valid.shape[2] - HISTORY_STEPS
+    if not 1 <= len(motion) <= max_steps + 1:
+        raise ValueError(f"its motion has {len(motion) - 1} steps, not 0 to {max_steps}")
     scene, agent = episode.world.actors.T
     if not np.allclose(motion[0], episode.world.logged[scene, agent, CURRENT_STEP], rtol=0.0, atol=SAME_M):
         raise ValueError("its motion does not begin as the log of its scenario")

@@ -1,5 +1,6 @@
 """Scenarios and the traffic model of an environment, loaded once and shared by all episodes."""
 
+import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -115,9 +116,11 @@ class Source:
         """
         if goals and (self.policy is None or not is_goal_conditioned(self.policy)):
             raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
+        num_actions = math.ceil(self.config.max_steps / self.controls.steps)
         world = build_world(
             scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
             context=self._context(scenarios), data=dataset_folder(self.config.data),
+            max_steps=num_actions * self.controls.steps,
         )  # fmt: skip
         if not len(world.actors):
             raise ConfigError(

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.scene import GREEN, RED, YELLOW, Lights, Scene
 from rlftsim.errors import ConfigError, DataError, EpisodeFailure
@@ -26,7 +26,7 @@ from rlftsim.scenario.synthetic.causal import BodyState, SumoPose, advance_body
 from rlftsim.scenario.synthetic.crop import on_grid
 from rlftsim.scenario.synthetic.windows import HEADING_GRID_PER_RAD, POSITION_GRID_PER_M, VELOCITY_GRID_PER_MPS
 from rlftsim.scenario.synthetic.worlds import REMEDY, WindowSource, find_window
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 WORKER = "rlftsim.scenario.synthetic.rerun"
 MAX_WORLDS = 16
@@ -58,8 +58,8 @@ class SumoState:
 
     poses: Poses
     bodies: tuple[BodyState, ...]
-    last_step: Int64[np.ndarray, "A"]
-    """Last step of the log's time at which each agent is there: vehicles leave where the network ends."""
+    has_left: Bool[np.ndarray, "A"]
+    """True = is not there any more: vehicles leave where the network ends."""
     lights: Lights
     """Lights of the scene, up to the present step as SUMO showed them."""
     off_lane_steps: int = 0
@@ -108,8 +108,8 @@ def build_sumo_scene(scene: Scene, data: Path) -> SumoScene:
 
 def begin_sumo(sumo_scene: SumoScene, scene: Scene) -> SumoState:
     """State at the current step of the log."""
-    last_step = np.full(len(scene.object_id), TOTAL_STEPS)
-    return SumoState((), tuple(track.state for track in sumo_scene.window.tracks), last_step, scene.lights)
+    has_left = np.zeros(len(scene.object_id), bool)
+    return SumoState((), tuple(track.state for track in sumo_scene.window.tracks), has_left, scene.lights)
 
 
 def advance_sumo(
@@ -134,12 +134,12 @@ def advance_sumo(
     answer = _find_world(sumo_scene.window.path).step(sumo_scene.window.index, poses)
     step = CURRENT_STEP + len(poses)
     motion = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], 1)
-    bodies, last_step = list(state.bodies), state.last_step.copy()
+    bodies, has_left = list(state.bodies), state.has_left.copy()
     rows = []
     for index, (track, track_pose) in enumerate(zip(sumo_scene.window.tracks, answer["poses"], strict=True)):
         row = sumo_scene.rows[index]
         if track_pose is None:
-            last_step[row] = min(last_step[row], step - 1)
+            has_left[row] = True
             continue
         bodies[index], box = advance_body(track.shape, bodies[index], tuple(track_pose))
         rows.append((row, *box))
@@ -152,7 +152,7 @@ def advance_sumo(
     colors = np.array([COLORS.get(letter, RED) for letter in answer["lights"]], np.int64)[sumo_scene.lights]
     lights = _with_colors(state.lights, step, colors)
     counts = answer["off_lane_steps"], answer["num_strangers"]
-    return SumoState(poses, tuple(bodies), last_step, lights, *counts), motion
+    return SumoState(poses, tuple(bodies), has_left, lights, *counts), motion
 
 
 def _with_colors(lights: Lights, step: int, colors: Int64[np.ndarray, "T"]) -> Lights:

@@ -32,11 +32,12 @@ from rlftsim.envs.sumo_traffic import SumoScene, SumoState, advance_sumo, begin_
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.threads import one_thread
-from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.policy import Policy, Sampling, get_device
+from rlftsim.rollout.simulate import encode_lights
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STEPS, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, STEP_S, TOTAL_STEPS, Scenario
 
 IDM = IdmConfig()
 Noise = Literal["same", "new"]
@@ -52,7 +53,7 @@ class Dice:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """B scenes that step together, and the driver of each agent."""
+    """B scenes that step together, S steps of the log's time, and the driver of each agent."""
 
     scenes: tuple[Scene, ...]
     batch: ScenarioBatch
@@ -66,23 +67,24 @@ class World:
     """Length and width."""
     height: Float[np.ndarray, "B A"]
     object_type: Int64[np.ndarray, "B A"]
-    logged_steps: Float[np.ndarray, "91 B A 5"]
+    logged_steps: Float[np.ndarray, "S B A 5"]
     """Logged motion, the numbers of a step side by side."""
-    logged_z: Float[np.ndarray, "B A 91"]
-    valid: Bool[np.ndarray, "B A 91"]
+    logged_z: Float[np.ndarray, "B A S"]
+    valid: Bool[np.ndarray, "B A S"]
     policy: Policy | None
     """None where no agent follows a policy."""
     context: Any
+    """Scenarios as the policy encodes them, with the lights of the current step."""
     goals: Goals | None
     sampling: Sampling
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
     sumo_scenes: tuple[SumoScene, ...]
     """Of each scene where SUMO drives the others; else empty."""
-    is_present: Bool[np.ndarray, "B A 91"]
-    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends. What
-    SUMO has let leave is in `find_presence`."""
-    is_observed: Bool[np.ndarray, "B A 91"]
+    is_present: Bool[np.ndarray, "B A S"]
+    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends. Those
+    that have left since are in `WorldState.has_left`."""
+    is_observed: Bool[np.ndarray, "B A S"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
     """True = heights count in the scene, see `levels`."""
@@ -95,7 +97,7 @@ class World:
         return {driver: (scene[drivers == driver], agent[drivers == driver]) for driver in Driver}
 
     @property
-    def logged(self) -> Float[np.ndarray, "B A 91 5"]:
+    def logged(self) -> Float[np.ndarray, "B A S 5"]:
         """Logged motion of each agent; a view."""
         return np.moveaxis(self.logged_steps, 0, 2)
 
@@ -106,6 +108,8 @@ class Block:
 
     policy_state: Any
     """State of the policy before them."""
+    context: Any
+    """Context that they are made in: lights change every 2 s from second 8 on, see `encode_lights`."""
     decision: Tensor | None
     """None before the first block."""
     poses: Float[np.ndarray, "B A k 3"] | None
@@ -123,17 +127,19 @@ class WorldState:
     block: Block | None
     """None where no agent follows a policy."""
     noise: Float[Tensor, "B 1 A L n"] | None
-    """Of all decisions of the episode."""
+    """Of all decisions of the present 8 s."""
     dice: tuple[tuple[Dice, ...], ...]
     """Dice of each scene, at each decision taken so far and for all that follow (the last entry)."""
     idm_states: tuple[Float[np.ndarray, "_ 2"], ...]
     """Distance along the line, and speed, of the IDM-driven agents of each scene."""
     sumo_states: tuple[SumoState, ...] = ()
     """Of each scene where SUMO drives the others."""
+    has_left: tuple[Bool[np.ndarray, "B A"], ...] = ()
+    """True = the agent is not there any more, at the same steps as `track`; empty where nobody leaves."""
 
     @property
     def step(self) -> int:
-        """Steps taken, 0..80."""
+        """Steps taken."""
         return len(self.track) - 1 - CURRENT_STEP
 
     @property
@@ -151,6 +157,7 @@ def build_world(
     sampling: Sampling = Sampling(),  # noqa: B008
     context: Any = None,
     data: Path | None = None,
+    max_steps: int = FUTURE_STEPS,
 ) -> World:
     """The world of some scenarios, which step together.
 
@@ -162,12 +169,14 @@ def build_world(
         sampling: Temperature and truncation of the policy's decisions.
         context: Result of `policy.encode` for these scenarios; None = computed here.
         data: Folder of the data set, which has the worlds that SUMO runs again.
+        max_steps: Largest number of steps; replayed agents are gone after their log's end, and lights hold.
 
     Raises:
         ConfigError: a rule that does not fit, or agents that follow the policy where `policy` is left out.
         DataError: SUMO is to drive in a scenario without a world.
     """
-    scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
+    num_steps = max(TOTAL_STEPS, HISTORY_STEPS + max_steps)
+    scenes = tuple(build_env_scene(scenario, num_steps) for scenario in scenarios)
     batch = collate(scenarios)
     shape = tuple(batch.agent_mask.shape)
     drivers = padded([assign_drivers(scene, rules) for scene in scenes], shape, -1)
@@ -183,7 +192,7 @@ def build_world(
     if by_sumo and data is None:
         raise ConfigError("SUMO drives in scenarios of a data set alone: name its folder as `data`.")
     mask = batch.agent_mask.cpu().numpy()
-    valid = padded([scene.valid for scene in scenes], (*shape, TOTAL_STEPS), False)
+    valid = padded([scene.valid for scene in scenes], (*shape, num_steps), False)
     # from the current step on all agents exist, but replayed ones are gone after the last state of their log
     goes_on = np.maximum.accumulate(valid[..., ::-1], axis=-1)[..., ::-1]
     simulated = (drivers != Driver.REPLAY)[..., None]
@@ -200,9 +209,9 @@ def build_world(
         height=padded([scene.size[:, 2] for scene in scenes], shape),
         object_type=padded([scene.object_type for scene in scenes], shape, 0),
         logged_steps=np.ascontiguousarray(
-            np.moveaxis(padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)), 2, 0)
+            np.moveaxis(padded([scene.logged for scene in scenes], (*shape, num_steps, 5)), 2, 0)
         ),
-        logged_z=padded([scene.logged_z for scene in scenes], (*shape, TOTAL_STEPS)),
+        logged_z=padded([scene.logged_z for scene in scenes], (*shape, num_steps)),
         valid=valid,
         is_present=is_present,
         is_observed=is_present & (simulated | valid),
@@ -241,13 +250,15 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     if world.policy is not None:
         initial = _noise(world, dice, "begin", world.policy.initial_noise_size)
         with one_thread(), torch.no_grad():
-            block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
-        noise = _decision_noise(world, dice)
+            block = Block(world.policy.begin(world.context, 1, world.goals, initial), world.context, None, None)
+        noise = _decision_noise(world, dice, 0)
     idm_states = tuple(begin_idm(lines, scene) for scene, lines in zip(world.scenes, world.lines))
     track = tuple(world.logged_steps[: CURRENT_STEP + 1].copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
     sumo_states = tuple(begin_sumo(sumo_scene, scene) for sumo_scene, scene in zip(world.sumo_scenes, world.scenes))
-    return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states)
+    leaves = bool(world.sumo_scenes) or any(np.isfinite(lines.exit_m).any() for lines in world.lines)
+    has_left = (np.zeros(world.mask.shape, bool),) * (len(track) if leaves else 0)
+    return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states, has_left)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
@@ -260,11 +271,13 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     """
     block, dice = state.block, state.dice
     following = len(state.track)  # step of the log's time that is being computed
-    motion = world.logged_steps[min(following, TOTAL_STEPS - 1)].copy()  # replayed agents
+    motion = world.logged_steps[following].copy()  # replayed agents
     previous = state.motion
     # 1. agents of the policy, and those that keep their velocity
     if block is not None:
         assert world.policy is not None
+        if state.step and state.step % FUTURE_STEPS == 0:
+            state = with_dice(world, state, dice[-1])  # noise of the next 8 s
         if state.step % world.policy.steps_per_decision == 0:
             block = _decide(world, state)
             dice = (*dice, dice[-1])
@@ -282,7 +295,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     if len(driven[0]):
         motion[driven] = previous[driven]
         motion[(*driven, slice(3, 5))] = 0.0  # parked ones stay; those with a line move below
-        present = world.is_present[:, :, following - 1]
+        present = find_presence(world, state, 1)[0][..., 0]
         moved_states = []
         for b, (scene, lines) in enumerate(zip(world.scenes, world.lines)):
             agents = b, slice(len(scene.object_id))
@@ -300,18 +313,36 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     # 4. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
-    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, idm_states, tuple(sumo_states))
+    # 5. those that have left
+    has_left = state.has_left
+    if has_left:
+        left = has_left[-1].copy()
+        for b, (lines, idm_state) in enumerate(zip(world.lines, idm_states)):
+            left[b, lines.agents] |= idm_state[:, 0] >= lines.exit_m
+        for b, sumo_state in enumerate(sumo_states):
+            left[b, : len(sumo_state.has_left)] |= sumo_state.has_left
+        has_left = (*has_left, left)
+    track, heights = (*state.track, motion), (*state.z, z)
+    return WorldState(track, heights, block, state.noise, dice, idm_states, tuple(sumo_states), has_left)
 
 
-def find_presence(world: World, state: WorldState) -> tuple[Bool[np.ndarray, "B A T"], Bool[np.ndarray, "B A T"]]:
-    """`is_present` and `is_observed` at the T steps of the log's time up to the present one."""
-    num_steps = len(state.track)
-    present, observed = world.is_present[..., :num_steps], world.is_observed[..., :num_steps]
-    if not state.sumo_states:
+def find_presence(
+    world: World, state: WorldState, num_steps: int | None = None
+) -> tuple[Bool[np.ndarray, "B A T"], Bool[np.ndarray, "B A T"]]:
+    """`is_present` and `is_observed` at the last T steps of the log's time up to the present one.
+
+    Args:
+        world: Scenes that step together.
+        state: Present state of the world.
+        num_steps: Number T of steps; None = all since the first of the log.
+    """
+    end = len(state.track)
+    steps = slice(0 if num_steps is None else end - num_steps, end)
+    present, observed = world.is_present[..., steps], world.is_observed[..., steps]
+    if not state.has_left:
         return present, observed
-    last_step = padded([sumo_state.last_step for sumo_state in state.sumo_states], present.shape[:2], 0)
-    is_left = np.arange(num_steps) > last_step[..., None]
-    return present & ~is_left, observed & ~is_left
+    has_left = np.stack(state.has_left[steps], -1)
+    return present & ~has_left, observed & ~has_left
 
 
 def find_lights(world: World, state: WorldState) -> list[Lights]:
@@ -328,7 +359,7 @@ def _follow_levels(
         world: Scenes that step together.
         z: Heights of the centers before the step, m.
         motion: Motion of all agents after the step.
-        step: Step of the log's time after the step, 11 to 90.
+        step: Step of the log's time after the step, 11 or later.
     """
     z = z.copy()
     for b, scene in enumerate(world.scenes):
@@ -336,8 +367,8 @@ def _follow_levels(
             half = scene.size[:, 2] / 2
             count = len(half)
             z[b, :count] = scene.levels.follow(motion[b, :count, :2], z[b, :count] - half) + half
-    logged = world.logged_z[:, :, min(step, TOTAL_STEPS - 1)]
-    return np.where(world.has_levels[:, None] & (world.drivers == Driver.REPLAY), logged, z)
+    is_replayed = world.has_levels[:, None] & (world.drivers == Driver.REPLAY)
+    return np.where(is_replayed, world.logged_z[:, :, step], z)
 
 
 def fork(world: World, state: WorldState, number: int, noise: Noise = "same") -> tuple[WorldState, ...]:
@@ -371,7 +402,7 @@ def with_dice(world: World, state: WorldState, dice: Sequence[Dice]) -> WorldSta
         state: State of these scenes; not changed.
         dice: Randomness of the traffic, per scene.
     """
-    noise = None if state.noise is None else _decision_noise(world, dice)
+    noise = None if state.noise is None else _decision_noise(world, dice, state.step // FUTURE_STEPS)
     return replace(state, noise=noise, dice=(*state.dice[:-1], tuple(dice)))
 
 
@@ -384,12 +415,13 @@ def _decide(world: World, state: WorldState) -> Block:
     with one_thread(), torch.no_grad():
         policy_state = block.policy_state
         if block.decision is not None:
-            policy_state = policy.advance(world.context, policy_state, block.decision, _forced(world, state))
-        distribution = policy.decide(world.context, policy_state)
-        index = state.step // policy.steps_per_decision
+            policy_state = policy.advance(block.context, policy_state, block.decision, _forced(world, state))
+        context = encode_lights(policy, world.batch, block.context, state.step)
+        distribution = policy.decide(context, policy_state)
+        index = state.step % FUTURE_STEPS // policy.steps_per_decision
         decision = distribution.sample(world.sampling, state.noise[..., index, :])
-        poses = policy.advance(world.context, policy_state, decision).poses
-    return Block(policy_state, decision, poses[:, 0].cpu().numpy().astype(np.float64))
+        poses = policy.advance(context, policy_state, decision).poses
+    return Block(policy_state, context, decision, poses[:, 0].cpu().numpy().astype(np.float64))
 
 
 def _forced(world: World, state: WorldState) -> AgentStates | None:
@@ -404,10 +436,17 @@ def _forced(world: World, state: WorldState) -> AgentStates | None:
     return AgentStates(done[..., :2], done[..., 2], valid)
 
 
-def _decision_noise(world: World, dice: Sequence[Dice]) -> Tensor:
+def _decision_noise(world: World, dice: Sequence[Dice], block: int) -> Tensor:
+    """Noise of the decisions in 8 s, as `simulate` draws it.
+
+    Args:
+        world: Scenes that step together.
+        dice: Randomness of the traffic, per scene.
+        block: Number of the 8 s, from 0.
+    """
     assert world.policy is not None
     num_decisions = FUTURE_STEPS // world.policy.steps_per_decision
-    noise = _noise(world, dice, "decide", num_decisions * world.policy.noise_size)
+    noise = _noise(world, dice, name_decisions(block), num_decisions * world.policy.noise_size)
     return noise.unflatten(-1, (num_decisions, -1))
 
 

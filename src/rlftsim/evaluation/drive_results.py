@@ -56,6 +56,7 @@ class DriveSettings:
     num_rollouts: int
     seed: int
     rlftsim_version: str
+    seconds: float = 8.0
     planner_code: str = ""
     """Hash of the file that defines the planner."""
     manifest_sha256: str = ""
@@ -213,11 +214,11 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
         alpha: Probability of calling a difference that is none.
 
     Raises:
-        DataError: Unequal numbers of rollouts, seeds or data, or no scenario in common.
+        DataError: Unequal numbers of rollouts, lengths, seeds or data, or no scenario in common.
     """
     # a data set may have moved, or be another one at the same place; older results know its place alone
     know_content = a.settings.manifest_sha256 and b.settings.manifest_sha256
-    compared = {name: name for name in ("num_rollouts", "seed", "split")}
+    compared = {name: name for name in ("num_rollouts", "seed", "split", "seconds")}
     compared["dataset"] = "manifest_sha256" if know_content else "dataset"
     for label, setting in compared.items():
         if getattr(a.settings, setting) != getattr(b.settings, setting):

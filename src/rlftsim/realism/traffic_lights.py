@@ -122,20 +122,23 @@ def _compute_squared_length(direction: Float[np.ndarray, "*shape 2"]) -> Float[n
     return np.where(squared_length > 0, squared_length, np.float32(1))
 
 
-def build_signals(features: MapFeatures, lights: LightStates, device: torch.device) -> Signals | None:
+def build_signals(
+    features: MapFeatures, lights: LightStates, device: torch.device, num_steps: int = TOTAL_STEPS
+) -> Signals | None:
     """Traffic lights and surface-street lanes, packed; None where no light can be violated.
 
     Args:
         features: Features of the map; only surface-street lanes count.
         lights: Logged observations of all traffic lights, any number per step.
         device: Device of the tensors, that of the agents to be measured.
+        num_steps: Number S of steps of the log.
     """
     # 1. States [S, J] and stop points [S, J, 2]. A light that is not observed at a step has state 0 (unknown) and stop
     #    point (0, 0), as officially; of two observations the last one counts.
     lane_ids, column = np.unique(lights.lane_id, return_inverse=True)
-    state = np.zeros((TOTAL_STEPS, len(lane_ids)), np.int64)
-    stop = np.zeros((TOTAL_STEPS, len(lane_ids), 2), np.float32)
-    in_time = lights.step < TOTAL_STEPS
+    state = np.zeros((num_steps, len(lane_ids)), np.int64)
+    stop = np.zeros((num_steps, len(lane_ids), 2), np.float32)
+    in_time = lights.step < num_steps
     state[lights.step[in_time], column[in_time]] = lights.state[in_time]
     stop[lights.step[in_time], column[in_time]] = lights.stop_point[in_time, :2]
     # 2. Only lights of surface-street lanes can be violated.

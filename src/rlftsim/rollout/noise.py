@@ -16,6 +16,15 @@ def derive_seed(*values: object) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
 
 
+def name_decisions(block: int) -> str:
+    """Stream of the noise of decisions, which is drawn for 8 s at once, so that it depends on no rollout's length.
+
+    Args:
+        block: Number of the 8 s, from 0.
+    """
+    return f"decide after block {block}" if block else "decide"
+
+
 def draw_noise(
     batch: ScenarioBatch, rollout_ids: range, *, seed: int, purpose: str, per_agent: int
 ) -> Float[Tensor, "B N A k"]:

@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.entries import EntryModel
-from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.open_world import OpenWorld
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -101,8 +101,7 @@ def simulate(
     draws = state.draws
     poses, decisions, log_probs, forced_states, masks = [], [], [], [], []
     for step, decision_noise in zip(range(0, num_steps, stride), noise):
-        if step >= FUTURE_STEPS and step % RELIT_STEPS == 0 and _changes_lights(batch, CURRENT_STEP + step):
-            context = policy.encode(replace(batch, light_step=CURRENT_STEP + step))
+        context = encode_lights(policy, batch, context, step)
         distribution = policy.decide(context, state)
         arguments = (sampling, decision_noise)
         decision = choose(distribution, state, *arguments) if choose else distribution.sample(*arguments)
@@ -152,9 +151,19 @@ def _join_decisions(
     return Rollouts(path[..., :2], path[..., 2], torch.stack(decisions, dim=3), mask, log_prob, forced=all_forced)
 
 
-def _changes_lights(batch: ScenarioBatch, step: int) -> bool:
-    """True where a log still has traffic lights at a step, which are no more than a signal plan to the agents."""
-    return any(len(s.lights.step) and step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
+def encode_lights(policy: Policy, batch: ScenarioBatch, context: Any, step: int) -> Any:
+    """Context with the lights of the log, every 2 s from second 8 on: a signal plan is no future of the agents.
+
+    Args:
+        policy: Policy that encodes.
+        batch: Scenarios of the rollouts.
+        context: Context up to now, which comes back at other steps and where no log has lights any more.
+        step: Simulated step, from 0.
+    """
+    log_step = CURRENT_STEP + step
+    has_lights = any(len(s.lights.step) and log_step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
+    is_due = step >= FUTURE_STEPS and step % RELIT_STEPS == 0
+    return policy.encode(replace(batch, light_step=log_step)) if is_due and has_lights else context
 
 
 def _draw_decision_noise(
@@ -163,8 +172,7 @@ def _draw_decision_noise(
     """Noise of one decision after the other, drawn for 8 s at once, so that it depends on no rollout's length."""
     per_block = FUTURE_STEPS // policy.steps_per_decision
     for block in itertools.count():
-        purpose = f"decide after block {block}" if block else "decide"
-        per_agent = per_block * policy.noise_size
+        purpose, per_agent = name_decisions(block), per_block * policy.noise_size
         noise = draw_noise(batch, rollout_ids, seed=seed, purpose=purpose, per_agent=per_agent)
         yield from noise.unflatten(-1, (per_block, -1)).unbind(-2)
 

@@ -21,6 +21,7 @@ def drive(
     limit: int | None = None,
     num_rollouts: int = 1,
     seed: int = 0,
+    seconds: float = 8.0,
     jobs: int = 1,
     film: str | None = None,
 ) -> int:
@@ -44,6 +45,7 @@ def drive(
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.
         seed: Seed of the traffic. The same seed gives every planner the same dice.
+        seconds: Length of the episodes. A longer one ends where the map does, and has fewer scores where the log ends.
         jobs: Processes, each with one thread. Changes no result.
         film: Scenarios to film, the types of traffic side by side: first, worst:N for the N lowest scores such as
             worst:5, or failures for collisions at fault and driving off the road. Written to OUT/SCENARIO.webp.
@@ -58,7 +60,7 @@ def drive(
     config = driving.DriveConfig(
         planner=planner, data=data, split=split, model=model,
         traffic=tuple(driver.strip() for driver in traffic.split(",")),
-        num_rollouts=num_rollouts, seed=seed, limit=limit,
+        num_rollouts=num_rollouts, seed=seed, seconds=seconds, limit=limit,
         scenarios=tuple(scenario) if scenario else None, jobs=jobs, film=film,
     )  # fmt: skip
     results = driving.drive(config, out)
