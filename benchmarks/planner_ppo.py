@@ -18,8 +18,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from rlftsim.envs import EgoEnv
-from rlftsim.envs.drive_scenario import run_planner
 from rlftsim.envs.driver_view import DriverView
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.sb3 import SB3VecEnv
 from rlftsim.evaluation.compare import compare_paired

@@ -16,9 +16,11 @@ from rlftsim.cli import main
 from rlftsim.envs import EgoEnv
 from rlftsim.envs import drive as drive_module
 from rlftsim.envs.drive import drive
-from rlftsim.envs.drive_scenario import DriveConfig, choose_films, run_planner, write_film
+from rlftsim.envs.drive_films import choose_films, write_film
+from rlftsim.envs.drive_scenario import DriveConfig
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, compute_idm_acceleration
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planner_scores import off_road
 from rlftsim.envs.planners import pdm
 from rlftsim.envs.planners.registry import PLANNERS, hash_code, load_planner, read_action_settings
@@ -545,7 +547,8 @@ def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch, tmp_path
     rollouts = iter(["free", "blocked", "rammed"])
     movers = {"free": (), "blocked": (Mover(x_m=30.0, speed_mps=0.0),), "rammed": (Mover(x_m=-15.0, speed_mps=15.0),)}
     results = {name: driven("constant_velocity", build_scenario(name, (Mover(), *movers[name]))) for name in movers}
-    monkeypatch.setattr("rlftsim.envs.drive_scenario.run_planner", lambda *_, **__: results[next(rollouts)])
+    for module in ("drive_scenario", "drive_films"):
+        monkeypatch.setattr(f"rlftsim.envs.{module}.run_planner", lambda *_, **__: results[next(rollouts)])
     (row,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=3))
     assert row.values("blamed_others_rate")[0] == 0.5
     assert row.values("others_collision_rate")[0] == 0.0  # NaN where the planner is alone
@@ -554,8 +557,8 @@ def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch, tmp_path
     # a crash in one rollout of three is a failure, and the film shows that rollout
     assert find_failures(row) == row.scenario_ids == choose_films([row], "failures")
     rollouts, filmed = iter(["free", "blocked", "rammed"]), {}
-    monkeypatch.setattr("rlftsim.envs.drive_scenario.build_animation", lambda records, _: filmed.update(records))
-    monkeypatch.setattr("rlftsim.envs.drive_scenario.to_film", lambda *_, **__: None)
+    monkeypatch.setattr("rlftsim.envs.drive_films.build_animation", lambda records, _: filmed.update(records))
+    monkeypatch.setattr("rlftsim.envs.drive_films.to_film", lambda *_, **__: None)
     config = DriveConfig("constant_velocity", traffic=("replay",), num_rollouts=3, film="failures")
     write_film(config, row.scenario_ids[0], tmp_path)
     assert filmed == {"constant_velocity in replay": results["blocked"].record}

@@ -10,7 +10,7 @@ import torch
 
 from rlftsim.cli.main import main
 from rlftsim.envs import EgoEnv
-from rlftsim.envs.drive_scenario import run_planner
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import hash_code, load_planner
 from rlftsim.errors import ConfigError
 from scenes import bend, straight_road

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv
-from rlftsim.envs.drive_scenario import run_planner
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.result import build_animation
 from rlftsim.envs.scene import build_env_scene

@@ -12,7 +12,7 @@ from PIL import Image
 import scenes
 from rlftsim.cli import main
 from rlftsim.envs import EgoEnv, parallel_env
-from rlftsim.envs.drive_scenario import run_planner
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.route import find_route
 from rlftsim.envs.world import Dice, begin, build_world, step_world

@@ -1,11 +1,10 @@
-"""Scenarios driven by a planner: scores, and films."""
+"""Scenarios driven by a planner, and their scores."""
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -13,20 +12,16 @@ import numpy as np
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.episode import advance, look, start
-from rlftsim.envs.planners.batch import BatchPlanner, acts_in_batches
-from rlftsim.envs.planners.registry import Planner, guard_planner, load_planner, read_action_settings
-from rlftsim.envs.record import build_record
-from rlftsim.envs.resets import describe_start
-from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
+from rlftsim.envs.planner_episode import run_batch, run_planner
+from rlftsim.envs.planners.batch import acts_in_batches
+from rlftsim.envs.planners.registry import load_planner, read_action_settings
+from rlftsim.envs.result import SCORE_NAMES, Result
 from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
-from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, EpisodeFailure, in_short, whole_number
-from rlftsim.evaluation.drive_results import FAILED, DriveResult, find_failures, is_failure, rank_scenarios
-from rlftsim.scenario.types import Scenario, count_steps
+from rlftsim.evaluation.drive_results import FAILED
+from rlftsim.scenario.types import count_steps
 from rlftsim.statistics import mean_interval
-from rlftsim.viewer.film import to_film
 
 ROW_SCORES = (*SCORE_NAMES, "blamed_others_rate", "others_realism")
 """Scores in the row of a scenario."""
@@ -94,65 +89,6 @@ class DriveConfig:
         return min(SIDE_BY_SIDE, max(num_scenarios // self.jobs, 1))
 
 
-def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
-    """Drive a scenario from the current step to the end.
-
-    Args:
-        env: Environment with the planner's type of action.
-        planner: Planner that drives, made by `load_planner`.
-        scenario: Scenario of the environment to drive to the end.
-        seed: Seed of the traffic; equal seeds, equal traffic for every planner.
-        rollout: Number of the rollout, 0 or more; each with dice of its own.
-
-    Raises:
-        EpisodeFailure: SUMO fails, or the planner raises an error, calls exit(), or wants what its type of action does
-            not allow.
-    """
-    observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
-        planner.reset(info)
-    while not env.state.ended[0]:
-        with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
-            action = planner.act(observation)
-        # of a step of the world only the action is the planner's
-        with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step, errors=(ConfigError,)):
-            observation, *_ = env.step(action)
-    return env.result()
-
-
-def run_batch(
-    source: Source, planner: BatchPlanner, scenarios: Sequence[Scenario], *, seed: int, rollouts: Iterable[int]
-) -> Iterator[list[Result]]:
-    """Drive scenarios side by side from the current step to the end; yields a result for each of them.
-
-    Args:
-        source: Source of the scenarios, with the planner's type of action.
-        planner: Planner that drives all egos.
-        scenarios: Scenarios to drive to the end.
-        seed: Seed of the traffic; equal seeds, equal traffic for every planner.
-        rollouts: Numbers of the rollouts, each with dice of its own.
-
-    Raises:
-        EpisodeFailure: SUMO fails, or the planner fails in any scenario.
-    """
-    # scores see at the end who has left the road: no event is asked for
-    episode = replace(source.episode(list(scenarios)), edges=None)
-    names = ", ".join(scenario.scenario_id for scenario in scenarios)
-    for rollout in rollouts:
-        state = start(episode, (Dice(seed, rollout),) * len(scenarios))
-        rows, step = range(len(scenarios)), 0
-        with guard_planner(planner, names, lambda: 0):
-            for row in rows:
-                planner.reset(describe_start(episode, state, row, source))
-        while not state.ended.all():
-            with guard_planner(planner, names, lambda now=step: now):
-                action = planner.act_batch(lambda now=state: look(episode, now).by_name())
-            with guard_planner(planner, names, lambda now=step: now, errors=(ConfigError,)):
-                state, _ = advance(episode, state, action)
-            step = state.world.step
-        yield [Result(build_record(episode, state, row)) for row in rows]
-
-
 def drive_scenarios(
     config: DriveConfig, traffic: str, ids: Sequence[str], positions: Sequence[int]
 ) -> list[dict[str, object]]:
@@ -192,49 +128,3 @@ def _build_row(scenario_id: str, traffic: str, results: Sequence[Result]) -> dic
 def make_environment(config: DriveConfig, traffic: str) -> EgoEnv:
     """Environment of a type of traffic, made once in each process."""
     return EgoEnv(source=Source(config.settings(traffic)))
-
-
-def choose_films(results: Sequence[DriveResult], choice: str) -> list[str]:
-    """Ids of the scenarios to film, the worst first; none in which the planner failed.
-
-    Args:
-        results: Results of a planner in all types of traffic.
-        choice: "first"; "worst:N" for the N lowest scores `nuplan_style` in any traffic; "failures" for scenarios in
-            which the planner is at fault for a collision or leaves the road.
-    """
-    failed = {scenario_id for result in results for scenario_id in result.failures}
-    if choice == "first":
-        return [scenario_id for scenario_id in results[0].scenario_ids if scenario_id not in failed][:1]
-    worst = [scenario for scenario in rank_scenarios(results) if scenario.scenario_id not in failed]
-    if choice == "failures":
-        failing = {scenario_id for result in results for scenario_id in find_failures(result)}
-        return [scenario.scenario_id for scenario in worst if scenario.scenario_id in failing]
-    return [scenario.scenario_id for scenario in worst[: int(choice.partition(":")[2])]]
-
-
-def write_film(config: DriveConfig, scenario_id: str, out: Path) -> Path:
-    """Write a film of a scenario, the types of traffic side by side; returns the path.
-
-    With `film="failures"` each traffic shows the first rollout with a failure, else the first rollout.
-
-    Args:
-        config: Planner, data, types of traffic and number of rollouts.
-        scenario_id: Scenario of the data set.
-        out: Folder for the film SCENARIO.webp.
-
-    Raises:
-        EpisodeFailure: The planner or SUMO fails in this scenario.
-    """
-    records, scores = {}, []
-    for traffic in config.traffic:
-        env = make_environment(config, traffic)
-        planner, scenario = load_planner(config.planner), env.source.scenario(scenario_id)
-        rollouts = range(config.num_rollouts if config.film == "failures" else 1)
-        results = (run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in rollouts)
-        first = next(results)
-        shown = first if is_failure(first.scores) else next((r for r in results if is_failure(r.scores)), first)
-        records[f"{config.planner} in {traffic}"] = shown.record
-        scores.append(shown.planner.nuplan_style)
-    path = out / f"{scenario_id}.webp"
-    to_film(path, build_animation(records, scores), steps_per_frame=2, dots_per_inch=70)
-    return path

@@ -278,19 +278,8 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     if atlas.heights:
         _leave_out_other_levels(world, atlas, state, nearest_on_route, {**distances, "neighbors": to_others})
     to_others[row, agent] = -1.0  # each agent comes before its neighbors
-    # 2. The nearest rows in order. The bits of a positive number sort as the number does; the lowest ones, which tell
-    # fractions of a micrometer apart, give way to the row, as numbers are sorted faster than rows by numbers.
-    keys = squared.view(np.int64)
-    keys &= ~_ROW_BITS
-    keys |= atlas.index
-    rows, is_hidden = {}, {}
-    for name in distances:
-        nearest, num_shown = keys[:, atlas.columns[name]], SHAPES[name][0] + (name == "neighbors")
-        if nearest.shape[1] > num_shown:
-            nearest.partition(num_shown - 1, axis=1)
-        nearest = nearest[:, :num_shown]
-        nearest.sort(axis=1)
-        rows[name], is_hidden[name] = nearest & _ROW_BITS, nearest > _SEEN_KEY
+    # 2. The nearest rows in order.
+    rows, is_hidden = _find_nearest_rows(atlas, squared, list(distances))
     # 3. The map in the frame of the agents.
     arrays = {name: np.empty((count, *SHAPES[name]), np.float32) for name in ("ego", "route", "goal", *distances)}
     arrays["lanes"] = atlas.lane_rows.reshape(-1, atlas.lane_rows.shape[2]).take(rows["lanes"], axis=0)
@@ -339,19 +328,49 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     _view_points(ego_history, 1)[..., 0], ego_history[..., 4] = offset[..., 0].T, speed.T
     ego_history[..., 2], ego_history[..., 3] = np.cos(direction[..., 0].T), np.sin(direction[..., 0].T)
     ego_history[is_absent[:, 0]] = 0.0
-    yaw_rate = wrapped(motion[:, 2] - moved[-2, :, 0, 2]) / STEP_S
-    ego, facts, length = arrays["ego"], atlas.agent_facts[scene, agent], world.size[scene, agent, 0]
-    is_moving = np.abs(speed[-1]) > 0.1
-    turn = WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(is_moving, speed[-1], 1.0)
-    ego[:, 0], ego[:, 1], ego[:, 2] = speed[-1], (speed[-1] - speed[-2]) / STEP_S, yaw_rate
-    ego[:, 3], ego[:, 4:6], ego[:, 6:10] = np.where(is_moving, np.arctan(turn), 0.0), facts[:, :2], beside_lane
-    ego[:, 10], ego[:, 11] = STEP_S * (steps - state.step), facts[:, 2]
+    ego, facts = arrays["ego"], atlas.agent_facts[scene, agent]
+    turn_rad = wrapped(motion[:, 2] - moved[-2, :, 0, 2])
+    ego[:, :4] = _measure_ego(speed, turn_rad, world.size[scene, agent, 0])
+    ego[:, 4:6], ego[:, 6:10], ego[:, 11] = facts[:, :2], beside_lane, facts[:, 2]
+    ego[:, 10] = STEP_S * (steps - state.step)
 
     for name, is_nothing in is_hidden.items():
         arrays[name][is_nothing] = 0.0
     masks = {f"{name}_mask": (~is_hidden[name]).view(np.int8) for name in ("route", *distances)}
     history = history[:, 1:].reshape(count, NEIGHBORS, -1)
     return Observation(**arrays, **masks, ego_history=ego_history, neighbors_history=history)
+
+
+def _find_nearest_rows(
+    atlas: Atlas, squared: Float[np.ndarray, "M N"], names: Sequence[str]
+) -> tuple[dict[str, Int64[np.ndarray, "M k"]], dict[str, Bool[np.ndarray, "M k"]]]:
+    """Rows of what is nearest to each agent in order, by name, and True for those out of sight.
+
+    The bits of a positive number sort as the number does; the lowest ones, which tell fractions of a micrometer apart,
+    give way to the row, as numbers are sorted faster than rows by numbers.
+    """
+    keys = squared.view(np.int64)
+    keys &= ~_ROW_BITS
+    keys |= atlas.index
+    rows, is_hidden = {}, {}
+    for name in names:
+        nearest, num_shown = keys[:, atlas.columns[name]], SHAPES[name][0] + (name == "neighbors")
+        if nearest.shape[1] > num_shown:
+            nearest.partition(num_shown - 1, axis=1)
+        nearest = nearest[:, :num_shown]
+        nearest.sort(axis=1)
+        rows[name], is_hidden[name] = nearest & _ROW_BITS, nearest > _SEEN_KEY
+    return rows, is_hidden
+
+
+def _measure_ego(
+    speed: Float[np.ndarray, "t M"], turn_rad: Float[np.ndarray, "M"], length: Float[np.ndarray, "M"]
+) -> Float[np.ndarray, "M 4"]:
+    """Speed, acceleration, yaw rate and steering angle of agents with the speeds of the last steps."""
+    yaw_rate, is_moving = turn_rad / STEP_S, np.abs(speed[-1]) > 0.1
+    turn = WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(is_moving, speed[-1], 1.0)
+    steering = np.where(is_moving, np.arctan(turn), 0.0)
+    return np.stack([speed[-1], (speed[-1] - speed[-2]) / STEP_S, yaw_rate, steering], -1)
 
 
 def _measure_square(x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:

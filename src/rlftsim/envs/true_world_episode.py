@@ -12,10 +12,10 @@ import numpy as np
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.conflicts import find_conflicts
-from rlftsim.envs.drive_scenario import run_planner
 from rlftsim.envs.drivers import Traffic
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.episode import Episode, ScenarioGoals
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planner_scores import PlannerScores
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.source import Source

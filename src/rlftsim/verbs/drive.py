@@ -55,7 +55,7 @@ def drive(
     """
     # Imported late: the environments need packages of an extra, and help does not.
     from rlftsim.envs import drive as driving
-    from rlftsim.envs.drive_scenario import choose_films, write_film
+    from rlftsim.envs.drive_films import choose_films, write_film
 
     config = driving.DriveConfig(
         planner=planner, data=data, split=split, model=model,
