@@ -174,7 +174,7 @@ def main():
     one = verbs.add_parser("drive")
     one.add_argument("--versions", nargs="+", required=True, help="values of PYTHONPATH, the oldest first")
     one.add_argument("--planners", nargs="*", default=["idm", "pdm"])
-    one.add_argument("--traffic", nargs="*", default=["replay", "policy"])
+    one.add_argument("--traffic", nargs="*", default=["replay"])
     one.add_argument("--limit", type=int, default=32)
     one.add_argument("--rounds", type=int, default=3)
     one.set_defaults(run=compare_drive)

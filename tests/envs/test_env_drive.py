@@ -667,11 +667,14 @@ def drive_idm(**settings):
 @pytest.mark.parametrize("name", ["idm", "pdm", "rlftsim.envs.planners.flawed:LateBraker"])
 def test_scenarios_side_by_side_have_the_scores_of_each_alone(name, monkeypatch):
     config = DriveConfig(name, traffic=("replay", "policy"), limit=3, num_rollouts=2)
+    # the maps of the others end at different times
+    longer = DriveConfig(name, traffic=("replay",), limit=4, seconds=20.0)
     assert config.count_side_by_side("replay", 3) == 3
-    together = drive(config)
+    together = [*drive(config), *drive(longer)]
     monkeypatch.setattr(DriveConfig, "count_side_by_side", lambda *_: 1)
-    for result, alone in zip(together, drive(config)):
+    for result, alone in zip(together, [*drive(config), *drive(longer)]):
         np.testing.assert_equal(result.table.to_pydict(), alone.table.to_pydict())
+        assert result.missing == alone.missing
 
 
 BATCH_PLANNERS = """

@@ -128,7 +128,7 @@ def test_an_ego_climbs_with_its_road_and_meets_what_stands_there():
 def test_cars_meet_on_a_steep_road_without_levels():
     drawn = build_scenario("hill", (Mover(speed_mps=0.0), Mover(x_m=60.0, y_m=0.2, speed_mps=0.0)))
     hill = raised(drawn, lambda x: 0.2 * x, ROAD, (0, 1))
-    assert build_env_scene(hill).levels is None
+    assert build_env_scene(hill, 91).levels is None
     assert len(pushed(hill).result().record.collisions) == 1
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 import scenes
 from rlftsim.cli import main
 from rlftsim.envs import EgoEnv, parallel_env
+from rlftsim.envs.drive_scenario import DriveConfig
 from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.route import find_route
@@ -120,7 +121,7 @@ def test_an_episode_ends_where_the_map_does():
     end_m = result.record.agent_motion[-1, 0]
     assert 140 + 20 < end_m < 140 + 40
     assert 80 < result.record.steps < 600
-    assert result.missing[f"score after {result.record.steps / 10:.1f} s"] == "the map ends there"
+    assert result.missing[f"scores beyond {result.record.steps / 10:.1f} s"] == "the map ends there"
     # not within the 8 s of the log, and not without a map
     fast = build_scenario("fast", (Mover(speed_mps=30.0),))
     assert driven(fast, "constant_velocity", traffic="replay").record.steps == 80
@@ -198,26 +199,29 @@ def test_a_token_may_end_after_the_last_step(policy):
 
 
 def test_refused_lengths():
-    for steps in (0, 36_001):
-        with pytest.raises(ConfigError, match="max_steps must lie between 1 and 36000"):
+    with pytest.raises(ConfigError, match=r"seconds must be at most 600, got 600\.1"):
+        DriveConfig("idm", seconds=600.1)
+    for steps in (0, 6_001):
+        with pytest.raises(ConfigError, match="max_steps must lie between 1 and 6000"):
             EgoEnv(scenarios=[straight_road()], traffic="replay", max_steps=steps)
 
 
 def test_drive_takes_seconds_and_films(tmp_path, capsys):
-    options = ["--data", "synthetic", "--limit", "1", "--traffic", "replay", "--out", str(tmp_path)]
-    assert main(["drive", "idm", *options, "--seconds", "12", "--film", "first"]) == 0
-    printed = capsys.readouterr().out
-    assert "no others_realism, the metric compares 8 s; no progress, the log ends after 8.0 s" in printed.replace(
-        "\n", ""
-    )
+    options = ["--data", "synthetic", "--limit", "1", "--traffic", "replay,constant_velocity", "--out", str(tmp_path)]
+    assert main(["drive", "idm", *options, "--seconds", "20", "--film", "first"]) == 0
+    printed = capsys.readouterr().out.replace("\n", "")
+    for traffic in ("replay", "constant_velocity"):
+        assert f"idm in {traffic}: no others_realism, the metric compares 8 s: " in printed
+        assert f"idm in {traffic}: no progress, the log ends after 8.0 s: " in printed
+    assert "idm in replay: no scores beyond 16.0 s, the map ends there: " in printed
     (film,) = tmp_path.glob("*.webp")
-    with Image.open(film) as pictures:
-        assert pictures.n_frames == 1 + 120 // 2
+    with Image.open(film) as pictures:  # as long as the longest episode
+        assert 1 + 160 // 2 <= pictures.n_frames <= 1 + 200 // 2
     long = DriveResult.read(tmp_path / "idm-replay.parquet")
-    assert long.settings.seconds == 12.0
+    assert long.settings.seconds == 20.0
     assert np.isfinite(long.values("nuplan_style")).all()
     assert main(["drive", "idm", *options]) == 2
     assert "another seconds" in capsys.readouterr().err
     other = DriveResult(replace(long.settings, seconds=8.0), long.table, long.missing)
-    with pytest.raises(DataError, match=r"with seconds 12\.0, .* with 8\.0"):
+    with pytest.raises(DataError, match=r"with seconds 20\.0, .* with 8\.0"):
         compare_drives(long, other)

@@ -66,7 +66,7 @@ def drive_steps(env, count, action=(0.3, 0.0)):
 
 def test_sumo_left_alone_is_the_log_in_every_bit(data):
     for scenario in ScenarioDataset(data):
-        scene = build_env_scene(scenario)
+        scene = build_env_scene(scenario, 91)
         sumo_scene = build_sumo_scene(scene, data)
         state, motion, rows = begin_sumo(sumo_scene, scene), scene.logged[:, 10], list(sumo_scene.rows)
         moved = 0.0

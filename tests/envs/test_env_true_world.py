@@ -33,7 +33,7 @@ MAP = (
 def kinds(monkeypatch, *movers):
     """Conflicts of an ego at 8 m/s with road users of SUMO."""
     scenario = build_scenario("conflict", (Mover(speed_mps=8.0), *movers), polylines(MAP))
-    scene = build_env_scene(scenario)
+    scene = build_env_scene(scenario, 91)
     rows = [row for row in range(len(scene.object_id)) if row != scene.ego]
     monkeypatch.setattr(conflicts, "build_sumo_scene", lambda *_: SimpleNamespace(rows=rows))
     return find_conflicts(scenario, Path("data"))

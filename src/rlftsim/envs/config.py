@@ -17,7 +17,8 @@ from rlftsim.scenario.types import FUTURE_STEPS
 StopReason = Literal["collision", "offroad", "goal"]
 ObservationFormat = Literal["dict", "flat", "arrays"]
 RenderMode = Literal["rgb_array", "html"]
-MAX_STEPS = 36_000
+MAX_STEPS = 6_000
+"""Greatest length of an episode, ten minutes: logs and lights are held to its end."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class EnvConfig:
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
         parse_terms(self.reward)
         if not 1 <= self.max_steps <= MAX_STEPS:
-            raise ConfigError(f"max_steps must lie between 1 and {MAX_STEPS}, an hour, got {self.max_steps}.")
+            raise ConfigError(f"max_steps must lie between 1 and {MAX_STEPS}, ten minutes, got {self.max_steps}.")
 
     @property
     def sampling(self) -> Sampling:

@@ -15,7 +15,7 @@ from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.envs.sumo_traffic import build_sumo_scene
 from rlftsim.geometry import wrapped
 from rlftsim.scenario.polylines import arc_length
-from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
 
 FOLLOWING, MERGING, CROSSING, PEDESTRIAN = "following", "merging", "crossing", "pedestrian"
 HEADWAY_S, HORIZON_S = 2.0, 4.0
@@ -44,9 +44,9 @@ def find_conflicts(scenario: Scenario, data: Path) -> frozenset[str]:
     Raises:
         DataError: The scenario has no world.
     """
-    scene = build_env_scene(scenario)
+    scene = build_env_scene(scenario, TOTAL_STEPS)
     agents = build_sumo_scene(scene, data).rows
-    route, search = find_route(scenario, scene.ego, "logged"), lane_search(scenario)
+    route, search = find_route(scenario, scene.ego, "logged", TOTAL_STEPS), lane_search(scenario)
     if not len(route) or search is None:
         return frozenset()
     motion = scene.logged[:, CURRENT_STEP]

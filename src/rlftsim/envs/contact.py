@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from rlftsim.envs.levels import is_on_level
 from rlftsim.envs.scene import SEGMENT_POINTS, Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners
-from rlftsim.scenario.types import Scenario, cached_on_scenario
+from rlftsim.scenario.types import TOTAL_STEPS, Scenario, cached_on_scenario
 
 STOPPED_MPS = 0.05
 """At most this fast an agent counts as stopped."""
@@ -128,7 +128,7 @@ class LaneSearch:
 @cached_on_scenario
 def lane_search(scenario: Scenario) -> LaneSearch | None:
     """The lanes of a scenario to be searched by position; None without lanes."""
-    scene = build_env_scene(scenario)
+    scene = build_env_scene(scenario, TOTAL_STEPS)
     graph, segments = scene.graph, scene.lanes
     if not len(graph):
         return None

@@ -134,10 +134,8 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     with claim_result(path, files, ids, find, runner) as claim:
         if claim.lease is not None:
             groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
-            title, task = (
-                f"{config.planner} in {settings.traffic}",
-                partial(_drive_group, config, settings.traffic, files),
-            )
+            title = f"{config.planner} in {settings.traffic}"
+            task = partial(_drive_group, config, settings.traffic, files)
             stored = run_items(title, groups, task, format=_Groups(files), lease=claim.lease, runner=runner)
             rows = [row for group in stored for row in group]
             missing = {row["scenario_id"]: reasons for row, reasons in rows}

@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.config import MAX_STEPS, EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.planner_episode import run_batch, run_planner
@@ -20,13 +20,14 @@ from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.errors import ConfigError, EpisodeFailure, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED
-from rlftsim.scenario.types import count_steps
+from rlftsim.jobs.progress import log
+from rlftsim.scenario.types import STEP_S, count_steps
 from rlftsim.statistics import mean_interval
 
 ROW_SCORES = (*SCORE_NAMES, "blamed_others_rate", "others_realism")
 """Scores in the row of a scenario."""
 SIDE_BY_SIDE = 16
-"""Scenarios that a planner drives at once at most."""
+"""Episodes that are driven or kept at once at most."""
 FILMS = re.compile(r"first|failures|worst:[1-9]\d{0,5}")
 
 
@@ -59,7 +60,8 @@ class DriveConfig:
         for name in ("num_rollouts", "jobs"):
             whole_number(name, getattr(self, name), 1)
         whole_number("seed", self.seed, 0)
-        count_steps(self.seconds)
+        if count_steps(self.seconds) > MAX_STEPS:
+            raise ConfigError(f"seconds must be at most {STEP_S * MAX_STEPS:g}, got {in_short(self.seconds)}.")
         check_choice(self.scenarios, self.limit)
         for traffic in self.traffic or ("",):
             if traffic not in TRAFFIC:
@@ -80,13 +82,13 @@ class DriveConfig:
         """Number of scenarios that are driven at once, such that every process has some.
 
         Args:
-            traffic: Driver of the other agents. Worlds of SUMO run one after the other; so does a traffic model, whose
-                last bits depend on what else is in a batch and may decide for another token.
+            traffic: Driver of the other agents. Worlds of SUMO and of IDM agents run one after the other; so does a
+                traffic model, whose last bits depend on what else is in a batch and may decide for another token.
             num_scenarios: Number of scenarios in the whole work.
         """
         if traffic not in ("replay", "constant_velocity") or not acts_in_batches(load_planner(self.planner)):
             return 1
-        return min(SIDE_BY_SIDE, max(num_scenarios // self.jobs, 1))
+        return max(min(SIDE_BY_SIDE // self.num_rollouts, num_scenarios // self.jobs), 1)
 
 
 def drive_scenarios(
@@ -100,12 +102,11 @@ def drive_scenarios(
         if acts_in_batches(planner):
             results = list(run_batch(env.source, planner, scenarios, seed=seed, rollouts=rollouts))
         else:
-            results = [
-                [run_planner(env, planner, scenario, seed=seed, rollout=rollout) for scenario in scenarios]
-                for rollout in rollouts
-            ]
+            (scenario,) = scenarios
+            results = [[run_planner(env, planner, scenario, seed=seed, rollout=rollout)] for rollout in rollouts]
     except EpisodeFailure as failure:
         if len(positions) > 1:  # the scenarios in which nothing fails have their scores
+            log.warning(f"{failure} These scenarios are driven one by one.")
             return [row for position in positions for row in drive_scenarios(config, traffic, ids, [position])]
         row = {"scenario_id": ids[positions[0]], "traffic": traffic, **dict.fromkeys(ROW_SCORES, math.nan)}
         return [{"row": row, "missing": {FAILED: str(failure)}}]  # of one rollout counts for the scenario

@@ -23,8 +23,8 @@ ON_LINE_M = 2.0
 """A light whose stop point is within this distance of a line is on the line."""
 BEYOND_M = 60.0
 """A line goes straight on so far beyond the logged way."""
-JOIN_M = 5
-"""A way goes on along the lanes so far ahead of its end."""
+JOIN_M, EXIT_M = 5, 2.0
+"""A way goes on along the lanes so far ahead of its end, and its agent leaves so far before these end."""
 PARKED_MPS = 0.5
 """A vehicle that is never faster in its log stays parked."""
 NEAREST, BEYOND_BOX_M = 16, 10.0
@@ -167,7 +167,7 @@ class IdmLines:
     wanted_mps: Float[np.ndarray, "M"]
     """The fastest logged speed, at least that of `IdmConfig` unless the agent backs up."""
     exit_m: Float[np.ndarray, "M"]
-    """Distance along the line where the agent leaves, beyond the lanes; infinite in scenes of 8 s."""
+    """Distance along the line where the agent leaves, beyond the lanes; infinite in scenes of 8 s and off the lanes."""
 
 
 def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
@@ -180,8 +180,8 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
     """
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
-    paths = [_logged_path(scene, int(agent)) for agent in agents]
-    sampled = [_sample_path(path) for path in paths]
+    ways = [_logged_path(scene, int(agent)) for agent in agents]
+    sampled = [_sample_path(path) for path, _ in ways]
     longest = max((len(line) for line, _ in sampled), default=1)
     shape = (len(agents), longest)
     points, heading, backs_up = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape, bool)
@@ -201,14 +201,12 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
         offset[~is_on_level(scene.lights.z - ground[..., None])] = np.inf
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
     facing = np.where(backs_up, wrapped(heading + np.pi), heading)
-    exit_m = np.full(len(agents), np.inf)
-    if scene.num_steps > TOTAL_STEPS:
-        exit_m = np.array([arc_length(path[:, :2])[-2 if len(path) > 2 else -1] - 2.0 for path in paths])
+    exit_m = np.array([arc_length(path[:, :2])[-2] - EXIT_M if goes_on else np.inf for path, goes_on in ways])
     return IdmLines(agents, points, heading, facing, turn_m, ground, stop, free_speed, exit_m)
 
 
-def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
-    """Poses of an agent's log where the agent moves, further lanes in a scene of more than 8 s, and a last pose."""
+def _logged_path(scene: Scene, agent: int) -> tuple[Float[np.ndarray, "p 3"], bool]:
+    """Poses of an agent's log where the agent moves, and a last pose; True where lanes of a long scene lie between."""
     logged = scene.logged[agent, CURRENT_STEP:]
     step = np.linalg.norm(np.diff(logged[:, :2], axis=0), axis=1)
     poses = logged[np.append(True, step > 0.05), :3]
@@ -218,16 +216,18 @@ def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
         direction = np.arctan2(last[1], last[0])
     else:
         poses = poses[:1]
+    goes_on = False
     if scene.num_steps > TOTAL_STEPS:
         lane_points = trace_lanes(scene, agent)
         distance = np.linalg.norm(lane_points - poses[-1, :2], axis=1)
         is_on_lane = distance.min(initial=np.inf) <= NEAR_LANE_M
         lane_points = lane_points[int(distance.argmin()) + JOIN_M :] if is_on_lane else lane_points[:0]
-        if len(lane_points) > 1:
+        goes_on = len(lane_points) > 1
+        if goes_on:
             poses = np.vstack([poses, np.column_stack([lane_points, compute_headings(lane_points)])])
             direction = poses[-1, 2]
     beyond = poses[-1] + BEYOND_M * np.array([np.cos(direction), np.sin(direction), 0.0])
-    return np.vstack([poses, beyond])
+    return np.vstack([poses, beyond]), goes_on
 
 
 def _sample_path(path: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, "P"]]:

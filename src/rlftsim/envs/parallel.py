@@ -20,6 +20,7 @@ from rlftsim.envs.spaces import action_space, format_observation, observation_sp
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.open import AnyScenarios
+from rlftsim.scenario.types import TOTAL_STEPS
 
 Controlled = str | Sequence[int | str]
 
@@ -85,7 +86,7 @@ class TrafficParallelEnv(ParallelEnv):
             return [str(object_id) for object_id in controlled]
         names: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
-            scene = build_env_scene(self.source.scenario(scenario_id))
+            scene = build_env_scene(self.source.scenario(scenario_id), TOTAL_STEPS)
             planner_ids = scene.object_id[assign_drivers(scene, self.source.rules) == Driver.PLANNER]
             names.update(dict.fromkeys(map(str, planner_ids.tolist())))
         return list(names)

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.episode import advance, look, start
 from rlftsim.envs.planners.batch import BatchPlanner
@@ -62,14 +64,17 @@ def run_batch(
     names = ", ".join(scenario.scenario_id for scenario in scenarios)
     for rollout in rollouts:
         state = start(episode, (Dice(seed, rollout),) * len(scenarios))
-        rows, step = range(len(scenarios)), 0
+        rows, steps = range(len(scenarios)), np.zeros(len(scenarios), int)
         with guard_planner(planner, names, lambda: 0):
             for row in rows:
                 planner.reset(describe_start(episode, state, row, source))
         while not state.ended.all():
+            step = state.world.step
             with guard_planner(planner, names, lambda now=step: now):
                 action = planner.act_batch(lambda now=state: look(episode, now).by_name())
             with guard_planner(planner, names, lambda now=step: now, errors=(ConfigError,)):
-                state, _ = advance(episode, state, action)
-            step = state.world.step
-        yield [Result(build_record(episode, state, row)) for row in rows]
+                following, _ = advance(episode, state, action)
+            steps[~state.ended] = following.world.step
+            state = following
+        # who has left the map stands there until the others have ended, which is not part of the episode
+        yield [Result(build_record(episode, state, row).first(int(steps[row]))) for row in rows]

@@ -132,7 +132,7 @@ def missing_scores(record: Record) -> dict[str, str]:
     if record.steps > FUTURE_STEPS:
         reasons["others_realism"] = f"the metric compares {FUTURE_STEPS * STEP_S:g} s"
     if record.steps > FUTURE_STEPS and record.has_left_map:
-        reasons[f"score after {record.steps * STEP_S:.1f} s"] = "the map ends there"
+        reasons[f"scores beyond {record.steps * STEP_S:.1f} s"] = "the map ends there"
     if not record.scene.scenario.has_future:
         reason = "the log's future is withheld, as in a test split"
         reasons |= dict.fromkeys(("progress", "making_progress", "displacement_error"), reason)

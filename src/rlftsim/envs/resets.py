@@ -71,7 +71,7 @@ def describe_start(episode: Episode, state: EpisodeState, row: int, source: Sour
     scene_row, agent = episode.world.actors[row]
     scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
     # map frame, from the current step on; NaN where there is no state
-    logged = episode.world.logged[scene_row, agent, CURRENT_STEP:, :3].copy()  # [81, 3]
+    logged = episode.world.logged[scene_row, agent, CURRENT_STEP:, :3].copy()  # [S - 10, 3]
     logged[~episode.world.valid[scene_row, agent, CURRENT_STEP:]] = np.nan
     return {
         "scenario": scene.scenario.scenario_id,

@@ -26,7 +26,7 @@ from rlftsim.goals.lane_paths import (
 from rlftsim.goals.proposals import CurrentAgent, propose_from_lanes
 from rlftsim.scenario.lane_graph import LaneGraph
 from rlftsim.scenario.polylines import arc_length
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, ObjectType, Scenario, cached_on_scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, ObjectType, Scenario, cached_on_scenario
 
 SPACING_M = 2.0
 BEYOND_M = 50.0
@@ -76,7 +76,7 @@ NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zer
 
 
 @cached_on_scenario
-def find_route(scenario: Scenario, agent: int, choice: RouteChoice, num_steps: int = TOTAL_STEPS) -> Route:
+def find_route(scenario: Scenario, agent: int, choice: RouteChoice, num_steps: int) -> Route:
     """Route of an agent; empty without lanes.
 
     Args:
@@ -116,7 +116,7 @@ def _logged_route(scene: Scene, agent: int) -> Route:
 
 
 def trace_lanes(scene: Scene, agent: int) -> Float[np.ndarray, "n 2"]:
-    """Points 1 m apart along the lanes that fit the logged way best, and straight on; none where no lane is.
+    """Points 1 m apart along the lanes that fit the logged way best, up to their end; none where no lane is.
 
     Args:
         scene: Scene with lanes and log. A scene of more than 8 s is traced 8 s after 8 s.

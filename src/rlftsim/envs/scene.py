@@ -15,7 +15,6 @@ from rlftsim.scenario.types import (
     CURRENT_STEP,
     ROAD_EDGE_TYPES,
     STEP_S,
-    TOTAL_STEPS,
     LightState,
     LightStates,
     MapFeatureType,
@@ -114,7 +113,7 @@ class Scene:
 
 
 @cached_on_scenario
-def build_env_scene(scenario: Scenario, num_steps: int = TOTAL_STEPS) -> Scene:
+def build_env_scene(scenario: Scenario, num_steps: int) -> Scene:
     """The scenario as arrays.
 
     Args:
@@ -221,11 +220,11 @@ def _cut_edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, 
         line = features.polyline(index).astype(np.float64) - [*scenario.origin, 0.0]
         line = line[np.isfinite(line[:, :2]).all(1)]
         corners = simplify(line[:, :2])
-        start, way = corners[:-1], np.diff(corners, axis=0)
-        counts = np.ceil(np.hypot(way[:, 0], way[:, 1]) / SEGMENT_LENGTH_M).astype(int).clip(1)
+        start, delta = corners[:-1], np.diff(corners, axis=0)
+        counts = np.ceil(np.hypot(delta[:, 0], delta[:, 1]) / SEGMENT_LENGTH_M).astype(int).clip(1)
         owner = np.repeat(np.arange(len(counts)), counts)
         piece = np.arange(len(owner)) - (counts.cumsum() - counts)[owner]
-        begin, end = (start[owner] + (k / counts[owner])[:, None] * way[owner] for k in (piece, piece + 1))
+        begin, end = (start[owner] + (k / counts[owner])[:, None] * delta[owner] for k in (piece, piece + 1))
         segments.append(np.concatenate([begin, end], axis=1))
         middle = (begin + end) / 2
         nearest = ((line[:, None, :2] - middle) ** 2).sum(-1).argmin(0) if has_levels and len(middle) else owner

@@ -114,17 +114,13 @@ def _leaves_road(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.nda
     x, y = np.moveaxis(record.motion[..., :2] + scene.scenario.origin, -1, 0)
     pose = np.stack([x, y, record.z, record.motion[..., 2]])  # [4, A, T + 1]
 
-    def is_off(agents: np.ndarray, steps: slice) -> Bool[np.ndarray, "n t"]:
-        states = Trajectories(*torch.from_numpy(pose[:, agents, steps]).float()[:, None])
-        size = torch.from_numpy(scene.size[agents, None]).float()
-        return compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy() >= OUTSIDE_M
-
     # those that stand do not leave the road
     agents = np.flatnonzero(vehicles & (pose != pose[..., :1]).any((0, 2)))
     if len(agents):
-        agents = agents[~is_off(agents, slice(1))[:, 0]]
-    if len(agents):
-        leaves[agents] = (is_off(agents, slice(1, None)) & record.is_observed[agents, 1:]).any(1)
+        states = Trajectories(*torch.from_numpy(pose[:, agents]).float()[:, None])
+        size = torch.from_numpy(scene.size[agents, None]).float()
+        off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy() >= OUTSIDE_M
+        leaves[agents] = ~off[:, 0] & (off & record.is_observed[agents]).any(1)
     return leaves
 
 

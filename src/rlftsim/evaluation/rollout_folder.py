@@ -43,7 +43,7 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
     """
     check_length(simulation.policy, simulation.num_steps)
     if simulation.entries is not None:
-        load_entries(simulation.entries)
+        load_entries(simulation.entries)  # what cannot be read is refused before the folder is touched
         check_decisions(simulation.policy.steps_per_decision)
     check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
     identity = simulation.describe()

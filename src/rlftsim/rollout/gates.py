@@ -101,9 +101,12 @@ class GateFinder:
             point: Point of a lane.
             distance_m: Length of the way.
         """
-        pending, points, distances = [(point, 0.0)], [], []
+        pending, points, distances, visited = [(point, 0.0)], [], [], set()
         while pending:
             start, driven_m = pending.pop()
+            if start in visited:
+                continue
+            visited.add(start)
             lane = int(np.searchsorted(self._first, start, "right")) - 1
             ahead = slice(start, int(self._first[lane + 1]))
             along_m = driven_m + self._along_m[ahead] - self._along_m[start]

@@ -180,11 +180,8 @@ class OpenWorld:
         self, n: int, pose: Float[np.ndarray, "A 3"], velocity: Float[np.ndarray, "A 2"], is_free: Bool[np.ndarray, "A"]
     ) -> list[tuple[int, Float[np.ndarray, "5 3"], bool]]:  # fmt: skip
         """Row and poses of each agent that enters a rollout, and True for vehicles parked beside the lane."""
-        gates, rng, present = (
-            self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m),
-            self.rngs[n],
-            self.present[n],
-        )
+        rng, present = self.rngs[n], self.present[n]
+        gates = self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m)
         rate = self.entries.expect(gates)
         rate = rate * (1 + self._turned_away[n] / max(rate.sum(), 1e-6))
         gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-rate)))
@@ -193,15 +190,15 @@ class OpenWorld:
         others, others_velocity = pose[present, :2], velocity[present]
         entered = []
         for k in range(len(gates)):
-            place = self._find_place(gates, entrants, k)
-            if place is None:
+            chosen = self._choose_pose(gates, entrants, k)
+            if chosen is None:
                 continue
-            position, heading, is_parked = place
+            position, heading, is_parked = chosen
             along, wanted_mps = np.array([np.cos(heading), np.sin(heading)]), float(entrants.speed_mps[k])
-            way = position + STRAIGHT_M[:, None] * along, STRAIGHT_M
+            route = position + STRAIGHT_M[:, None] * along, STRAIGHT_M
             if entrants.object_type[k] == ObjectType.VEHICLE and not is_parked:
-                way = self.finder.follow(int(gates.point[k]), LOOK_M)
-            speed = find_safe_speed(position, along, wanted_mps, others, others_velocity, *way)
+                route = self.finder.follow(int(gates.point[k]), LOOK_M)
+            speed = find_safe_speed(position, along, wanted_mps, others, others_velocity, *route)
             rows = free.get(int(entrants.object_type[k]), [])
             if speed is None or not rows or np.linalg.norm(position - pose[self.ego, :2]) < EGO_GAP_M:
                 continue
@@ -212,7 +209,7 @@ class OpenWorld:
         self._turned_away[n] = min(len(gates) - len(entered), MOST_TURNED_AWAY)
         return entered
 
-    def _find_place(
+    def _choose_pose(
         self, gates: Gates, entrants: Entrants, k: int
     ) -> tuple[Float[np.ndarray, "2"], float, bool] | None:
         """Position and heading of an entrant, and True for one that is parked; None where it would block a lane."""
@@ -241,9 +238,10 @@ def find_safe_speed(
     path: Float[np.ndarray, "p 2"],
     path_m: Float[np.ndarray, "p"],
 ) -> float | None:
-    """Speed to appear at: the wanted one, or less where braking at 3 m/s² could not avoid the agent ahead.
+    """Speed to appear at: the wanted one, or less where braking at 3 m/s² from half a second on could not avoid the
+    agent ahead.
 
-    None where somebody is too near, or one behind could not brake.
+    None where somebody is too near, or would be within 2 s, or one behind could not brake.
 
     Args:
         position: Place to appear at.

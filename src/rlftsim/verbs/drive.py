@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from rlftsim.evaluation.drive_results import FAILED, format_drives, format_worst, rank_scenarios
+from rlftsim.evaluation.drive_results import FAILED, DriveResult, format_drives, format_worst, rank_scenarios
 from rlftsim.jobs.progress import print_line, print_wide
 
 MAX_WORST = 5
@@ -66,10 +66,9 @@ def drive(
     results = driving.drive(config, out)
     worst = [scenario for scenario in rank_scenarios(results) if scenario.score < 1.0][:MAX_WORST]
     print_wide(format_drives(*results), *([format_worst(worst)] if worst else []))
-    for scenario_id, reasons in results[0].missing.items():
-        missing = "; ".join(f"no {name}, {reason}" for name, reason in reasons.items() if name != FAILED)
-        if missing:
-            print_line(f"  {scenario_id}: {missing}")
+    for result in results:
+        for line in describe_missing(result):
+            print_line(line)
     for result in results:
         failures, count = result.failures, len(result.table)
         for message in list(failures.values())[:MAX_WORST]:
@@ -80,3 +79,21 @@ def drive(
         print_line(write_film(config, scenario_id, out))
     print_line(f"{out}: {planner} in {traffic}, {len(results[0].table)} scenarios.")
     return int(any(result.failures for result in results))
+
+
+def describe_missing(result: DriveResult) -> list[str]:
+    """A line for each score that scenarios cannot give, with the reason and the first of the scenarios.
+
+    Args:
+        result: Scores of a planner in a type of traffic.
+    """
+    scenarios: dict[str, list[str]] = {}
+    for scenario_id, reasons in result.missing.items():
+        for name, reason in reasons.items():
+            if name != FAILED:
+                scenarios.setdefault(f"no {name}, {reason}", []).append(scenario_id)
+    lines = []
+    for missing, ids in scenarios.items():
+        others = f" and {len(ids) - MAX_WORST} more" if len(ids) > MAX_WORST else ""
+        lines.append(f"  {result.name}: {missing}: {', '.join(ids[:MAX_WORST])}{others}")
+    return lines

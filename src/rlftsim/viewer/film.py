@@ -92,7 +92,8 @@ class Camera:
             artists: list[Artist] = [*shapes, light_dots(axis, scene, lights_at)]
             if panel.notes:
                 corner = {"transform": axis.transAxes, "va": "top", "bbox": {"color": "white", "alpha": 0.7, "pad": 2}}
-                artists.append(axis.text(0.02, 0.98, panel.notes[step], fontsize=8, **corner))
+                note = panel.notes[min(step, len(panel.notes) - 1)]  # its episode may have ended before others
+                artists.append(axis.text(0.02, 0.98, note, fontsize=8, **corner))
             for shape in artists:
                 axis.draw_artist(shape)
                 shape.remove()

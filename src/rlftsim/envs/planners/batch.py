@@ -29,6 +29,5 @@ class BatchPlanner:
 
 
 def acts_in_batches(planner: object) -> TypeGuard[BatchPlanner]:
-    """True for a planner with a method `act_batch` that no subclass has replaced by an `act` of its own."""
-    definers = (vars(base) for base in type(planner).__mro__)
-    return next(("act_batch" in methods for methods in definers if {"act", "act_batch"} & methods.keys()), False)
+    """True for a `BatchPlanner` that has no `act` of its own."""
+    return getattr(type(planner), "act", None) is BatchPlanner.act

@@ -224,8 +224,8 @@ def _meets(
     view: View, motion: Float[np.ndarray, "M n t 5"], time_s: Float[np.ndarray, "t"]
 ) -> Bool[np.ndarray, "M n t K"]:
     """True where a proposal overlaps a box ahead or beside that has coasted for some time."""
-    place = view.boxes[:, None, :, :2] + time_s[:, None, None] * view.boxes[:, None, :, 3:]  # [M, t, K, 2]
-    x, y = (place[:, None, ..., axis] - motion[..., axis, None] for axis in range(2))  # [M, n, t, K]
+    position = view.boxes[:, None, :, :2] + time_s[:, None, None] * view.boxes[:, None, :, 3:]  # [M, t, K, 2]
+    x, y = (position[:, None, ..., axis] - motion[..., axis, None] for axis in range(2))  # [M, n, t, K]
     diagonal = np.hypot(view.box_size[..., 0], view.box_size[..., 1]) + np.hypot(*view.size.T)[:, None]
     reach = np.where(view.is_box, diagonal / 2 + 1e-6, -1.0)
     meets = x * x + y * y <= (np.abs(reach) * reach)[:, None, None]
@@ -251,9 +251,9 @@ def _leaves_road(view: View, motion: Float[np.ndarray, "M n t 5"]) -> Bool[np.nd
 def _nears_line(view: View) -> Bool[np.ndarray, "M K"]:
     """True for boxes that may meet a proposal's line within the time of the proposals."""
     time_s = STEP_S * np.arange(0, STEPS + SPARSE, SPARSE)[:, None, None]
-    place = view.boxes[:, None, :, :2] + time_s * view.boxes[:, None, :, 3:]  # [M, t, K, 2]
+    position = view.boxes[:, None, :, :2] + time_s * view.boxes[:, None, :, 3:]  # [M, t, K, 2]
     square = np.full(view.is_box.shape, np.inf)
-    for step in np.moveaxis(place, 1, 0):
+    for step in np.moveaxis(position, 1, 0):
         x, y = (step[..., axis, None] - view.line[:, None, :, axis] for axis in range(2))  # [M, K, P]
         square = np.minimum(square, (x * x + y * y).min(2))
     # between two sparse steps a box is at most half of its way from one of them

@@ -48,7 +48,8 @@ class Planner(Protocol):
         """Begin an episode.
 
         Args:
-            info: Information of the environment's reset; "logged" has the agent's logged poses [81, 3].
+            info: Information of the environment's reset; "logged" has the agent's logged poses from "now" on, [81, 3]
+                in an episode of 8 s.
         """
         ...
 

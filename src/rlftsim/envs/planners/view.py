@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.idm import LOOKAHEAD_M, ON_LINE_M
+from rlftsim.envs.observations import FAR_M
 
 STRAIGHT_M = 80.0
 """Without a route a planner drives straight on."""
-FAR_M = 1e7
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ def read_view(observation: Mapping[str, np.ndarray]) -> View:
     """View of observations in the agents' frames, of kind "dict" with a leading axis M."""
     ego, route = observation["ego"].astype(float), observation["route"].astype(float)
     is_box = observation["neighbors_mask"].astype(bool)
-    is_box = is_box[:, : np.count_nonzero(is_box.any(0))]  # the nearest come first
+    is_box = is_box[:, : np.flatnonzero(is_box.any(0)).max(initial=-1) + 1]
     neighbors = observation["neighbors"][:, : is_box.shape[1]].astype(float)
     num_points = np.count_nonzero(observation["route_mask"], axis=1)
     line, heading = _extend_routes(route[..., :2], num_points)

@@ -70,7 +70,8 @@ class Segments:
         padded = torch.stack([torch.cat([part, padding.expand(length - len(part), 2, 2)]) for part in maps])
         start, delta = padded.unbind(2)  # [B, S, 2]
         center, direction = start + delta / 2, delta / delta.norm(dim=-1, keepdim=True)
-        self._centers, self._poses = center, torch.cat([center, METERS_PER_TURN * direction], -1)
+        keys = center, torch.cat([center, METERS_PER_TURN * direction], -1)
+        self._centers, self._poses = ((key, key.square().sum(-1) / 2) for key in keys)
         self._table = torch.cat([start, delta, direction], -1).flatten(0, 1)
 
     def find_nearest(
@@ -89,10 +90,11 @@ class Segments:
             segments, and the segment's direction, a unit vector.
         """
         # 1. a few segments whose centers are nearest: the squared distance without the term that all share
-        keys, queries = self._centers, position
+        (keys, half_squares), queries = self._centers, position
         if heading is not None:
-            keys, queries = self._poses, torch.cat([queries, METERS_PER_TURN * heading_vector(heading)], -1)
-        half_squares, num_rows = keys.square().sum(-1) / 2, torch.bincount(scenario, minlength=len(keys)).tolist()
+            (keys, half_squares), turns = self._poses, METERS_PER_TURN * heading_vector(heading)
+            queries = torch.cat([queries, turns], -1)
+        num_rows = torch.bincount(scenario, minlength=len(keys)).tolist()
         indices = []
         for half_square, of_map, rows in zip(half_squares, keys, queries.split(num_rows)):
             gaps = torch.addmm(half_square, rows, of_map.mT, alpha=-1)  # [r, S]
