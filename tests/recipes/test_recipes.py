@@ -131,6 +131,14 @@ def test_fresh_weights_depend_on_the_recipes_seed_alone():
     assert any(not torch.equal(first[key], other[key]) for key in first)
 
 
+def test_a_seed_reaches_every_stage_and_nothing_else():
+    recipe = smart_demo_rlftsim()
+    seeded = recipe.with_seed(7)
+    stages = (seeded.tokens, seeded.pretrain, seeded.finetune, seeded.calibrate)
+    assert [stage.seed for stage in stages] == [7, 7, 7, 7]
+    assert seeded.with_seed(0) == recipe.with_seed(0) != recipe
+
+
 @pytest.mark.parametrize(
     ("section", "change", "words"),
     [

@@ -147,6 +147,12 @@ class Recipe:
         }
         return replace(self, **changed)
 
+    def with_seed(self, seed: int) -> "Recipe":
+        """The same recipe, every stage of which (tokens, pre-training, fine-tuning) draws with this seed."""
+        sections = {name: getattr(self, name) for name in section_names(self)}
+        drawn = {name: section for name, section in sections.items() if hasattr(section, "seed")}
+        return replace(self, **{name: replace(section, seed=seed) for name, section in drawn.items()})
+
 
 def section_names(recipe: Recipe) -> tuple[str, ...]:
     """Names of the sections of a recipe: `SECTIONS` in the order of use, then the further sections."""

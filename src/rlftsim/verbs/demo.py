@@ -12,7 +12,12 @@ from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
 from rlftsim.scenario.synthetic import pack_path
 
 
-def demo(out: Path | None = None, processes: int | Literal["auto"] = "auto", quick: bool = False) -> None:
+def demo(
+    out: Path | None = None,
+    processes: int | Literal["auto"] = "auto",
+    quick: bool = False,
+    seed: int | None = None,
+) -> None:
     """Run the whole pipeline on synthetic scenarios, in minutes, on a CPU.
 
     Vocabulary, pre-training, calibration in closed loop with the MLOO reward, evaluation on held-out scenarios, and a
@@ -23,13 +28,15 @@ def demo(out: Path | None = None, processes: int | Literal["auto"] = "auto", qui
         processes: Processes that train and that evaluate; auto = one for each core, up to 4. Another number
             rounds otherwise.
         quick: Run every stage at its smallest size. This shows that all stages work, not that fine-tuning helps.
+        seed: Seed of tokens, weights and training, to see how much of the result is luck. Left out: the recipe's.
     """
+    recipe = smart_demo_quick() if quick else smart_demo_rlftsim()
     # More processes than this only compete for memory bandwidth on the machines that the demo is made for.
     jobs = min(usable_cores(), 4) if processes == "auto" else processes
     # All rollouts in one pass: so small a model takes a quarter less time with it.
     evaluation = EvaluateConfig(rollouts_per_pass=32, jobs=jobs)
     config = DemoConfig(
-        (smart_demo_quick() if quick else smart_demo_rlftsim()).with_processes(processes),
+        (recipe if seed is None else recipe.with_seed(seed)).with_processes(processes),
         pack_path(),
         replace(evaluation, num_rollouts=8, limit=8) if quick else evaluation,
         num_played=2 if quick else 3,
