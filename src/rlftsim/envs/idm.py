@@ -94,55 +94,21 @@ def find_leaders(
     """
     if not boxes.shape[1]:
         return np.full(len(line), np.inf), np.zeros(len(line))
-    meets = find_meetings(line, heading, size[:, 1], boxes, box_size) & mask[..., None]
-    return choose_leaders(meets, heading, size[:, 0], boxes)
-
-
-def find_meetings(
-    line: Float[np.ndarray, "M W 2"],
-    heading: Float[np.ndarray, "M W"],
-    width: Float[np.ndarray, "M"],
-    boxes: Float[np.ndarray, "M K 5"],
-    box_size: Float[np.ndarray, "M K 2"],
-) -> Bool[np.ndarray, "M K W"]:
-    """True where a box is met by an agent whose center is at a point of the line.
-
-    Args:
-        line: Points ahead of each agent, a meter apart, map frame.
-        heading: Direction of the line at each point, rad.
-        width: Width of the agents, m.
-        boxes: Motion x, y, heading, vx, vy of the boxes that each agent may meet.
-        box_size: Length and width of these boxes, m.
-    """
     # 1. Every point of the line in the frame of every box [M, K, W].
     x, y = line[:, None, :, 0] - boxes[..., 0, None], line[:, None, :, 1] - boxes[..., 1, None]
     forward, lateral = map(np.abs, to_heading_frame(x, y, boxes[..., 2:3]))
     # 2. It meets the box if the agent's width across the line does.
-    turn, half = heading[:, None] - boxes[..., 2:3], width[:, None, None] / 2
+    turn, half = heading[:, None] - boxes[..., 2:3], size[:, 1, None, None] / 2
     meets = forward <= box_size[..., :1] / 2 + half * np.abs(np.sin(turn))
-    return meets & (lateral <= box_size[..., 1:] / 2 + half * np.abs(np.cos(turn)))
-
-
-def choose_leaders(
-    meets: Bool[np.ndarray, "M K W"],
-    heading: Float[np.ndarray, "M W"],
-    length: Float[np.ndarray, "M"],
-    boxes: Float[np.ndarray, "M K 5"],
-) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
-    """Gap to the first box that is met, and the box's speed along the line; infinite and 0 without a box.
-
-    Args:
-        meets: True where a box is met at a point of the line, as `find_meetings` returns it.
-        heading: Direction of the line at each point, rad.
-        length: Length of the agents, m.
-        boxes: Motion x, y, heading, vx, vy of the boxes.
-    """
+    meets &= lateral <= box_size[..., 1:] / 2 + half * np.abs(np.cos(turn))
+    meets &= mask[..., None]
+    # 3. The first point that meets any box, and that box's speed along the line there.
     any_box = meets.any(1)  # [M, W]
     first, has_leader, row = any_box.argmax(1), np.any(any_box, axis=1), np.arange(len(meets))
     box = meets[row, :, first].argmax(1)
     velocity, line_heading = boxes[row, box, 3:], heading[row, first]
     speed = np.maximum(velocity[:, 0] * np.cos(line_heading) + velocity[:, 1] * np.sin(line_heading), 0.0)
-    gap = np.maximum(first - length / 2, 0.0)
+    gap = np.maximum(first - size[:, 0] / 2, 0.0)
     return np.where(has_leader, gap, np.inf), np.where(has_leader, speed, 0.0)
 
 
