@@ -77,6 +77,6 @@ def test_files_of_long_rollouts_play_and_are_not_scored(scenario, tmp_path, caps
         assert arrays["x"].shape[2] == 120
     assert json.loads((out / "rollouts.json").read_text())["num_steps"] == 120
     assert main(["score", str(out), "--scenarios", "synthetic"]) != 0
-    assert "x must be floats [N, A, 80]" in capsys.readouterr().err
+    assert "rollouts of 12 s (120 steps), where 8 s are compared with the log" in capsys.readouterr().err
     assert main(["simulate", "constant_velocity", *options]) != 0  # 8 s, in a folder of 12 s
     assert "another num_steps" in capsys.readouterr().err

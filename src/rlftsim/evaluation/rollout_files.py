@@ -23,7 +23,7 @@ from rlftsim.jobs.documents import check_has_end
 from rlftsim.jobs.files import describe_type
 from rlftsim.realism import SimulatedStates
 from rlftsim.realism.agents import check_closed
-from rlftsim.scenario.types import FUTURE_STEPS
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
 
 FORMATS_NOTE = "see docs/rollout_formats.md"
 AXES = ("x", "y", "z", "heading")
@@ -172,6 +172,12 @@ def _states_of_npz(entry: RolloutEntry, num_steps: int | None) -> SimulatedState
     if (counts > 1).any():
         repeated = ", ".join(map(str, unique[counts > 1][:8]))
         raise DataError(f"object_ids must differ: {repeated} listed twice.")
+    lengths = {values.shape[-1] for values in arrays.values() if values.ndim == 3}
+    if num_steps is not None and len(lengths) == 1 and num_steps not in lengths:
+        raise DataError(
+            f"rollouts of {min(lengths) * STEP_S:g} s ({min(lengths)} steps), where {num_steps * STEP_S:g} s are "
+            f"compared with the log: simulate {num_steps * STEP_S:g} seconds, and leave the history out."
+        )
     expected = (len(ids), *(arrays["x"].shape[2:] if num_steps is None else [num_steps]))  # of [N, A, T] without N
     for axis, values in arrays.items():
         if values.dtype.kind != "f" or values.ndim != 3 or values.shape[1:] != expected or not len(values):
