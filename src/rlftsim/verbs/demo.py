@@ -24,7 +24,8 @@ def demo(
     report with pictures. An interrupted demo continues when the same command is repeated.
 
     Args:
-        out: Folder for everything; the report is OUT/report.html. Left out: runs/demo or runs/demo-quick.
+        out: Folder for everything; the report is OUT/report.html. Left out: runs/demo, runs/demo-quick or
+            runs/demo-seed-SEED.
         processes: Processes that train and that evaluate; auto = one for each core, up to 4. Another number
             rounds otherwise.
         quick: Run every stage at its smallest size. This shows that all stages work, not that fine-tuning helps.
@@ -43,5 +44,6 @@ def demo(
         num_listed=1 if quick else 3,
         is_quick=quick,
     )
-    result = run_demo(config, out or Path("runs/demo-quick" if quick else "runs/demo"))
+    name = f"demo{'-quick' if quick else ''}{'' if seed is None else f'-seed-{seed}'}"
+    result = run_demo(config, out or Path("runs") / name)
     print_line(f"report: {result.report}")
