@@ -15,7 +15,7 @@ from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.open_world import OpenWorld
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device, relight
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenarios
@@ -163,7 +163,7 @@ def encode_lights(policy: Policy, batch: ScenarioBatch, context: Any, step: int)
     log_step = CURRENT_STEP + step
     has_lights = any(len(s.lights.step) and log_step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
     is_due = step >= FUTURE_STEPS and step % RELIT_STEPS == 0
-    return policy.encode(replace(batch, light_step=log_step)) if is_due and has_lights else context
+    return relight(policy, context, replace(batch, light_step=log_step)) if is_due and has_lights else context
 
 
 def _draw_decision_noise(
