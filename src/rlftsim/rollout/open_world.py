@@ -62,6 +62,7 @@ def add_visitors(scenario: Scenario) -> Scenario:
     position = np.zeros((*shape, 3), np.float32)
     position[..., 0] = scenario.origin[0] + WAITING_M + WAITING_GAP_M * np.arange(len(types))[:, None]
     position[..., 1] = scenario.origin[1] + WAITING_M
+    position[..., 2] = tracks.position[scenario.ego_index, CURRENT_STEP, 2]
     visitors = Tracks(
         object_id=tracks.object_id.max() + 1 + np.arange(len(types)),
         object_type=types,
