@@ -2,6 +2,7 @@
 
     python benchmarks/planner_env.py speed [--rounds 3] [--model demo-base]
     python benchmarks/planner_env.py memory [--episodes 2000]
+    python benchmarks/planner_env.py steps --data long [--model demo-tuned] [--limit 3]
     python benchmarks/planner_env.py drive --versions OLD/src src [--limit 32] [--rounds 3]
     python benchmarks/planner_env.py table --data synthetic --limit 40 [--models demo-base runs/tuned] [--jobs 2]
 
@@ -21,7 +22,8 @@ import torch
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv
 from rlftsim.envs.drive import drive
-from rlftsim.envs.drive_scenario import DriveConfig
+from rlftsim.envs.drive_scenario import DriveConfig, make_environment
+from rlftsim.envs.planners.registry import load_planner
 from rlftsim.evaluation.drive_results import compare_drives, format_drives
 from rlftsim.jobs.progress import print_wide
 from rlftsim.policies.registry import load_policy
@@ -92,6 +94,23 @@ def speed(arguments):
     print(f"vector of 8 over one environment: {ratio:.2f}")
 
 
+def steps(arguments):
+    """CPU time of a step of `drive` in seconds 0 to 8 and 8 to 30."""
+    config = DriveConfig("idm", data=arguments.data, model=arguments.model, seconds=30.0)
+    env, planner, seconds = make_environment(config, "policy"), load_planner("idm"), []
+    for scenario in env.source.scenario_ids[: arguments.limit]:
+        observation, info = env.reset(seed=0, options={"scenario": scenario})
+        planner.reset(info)
+        taken = []
+        while not env.state.ended[0]:
+            action, begin = planner.act(observation), time.process_time()
+            observation, *_ = env.step(action)
+            taken.append(time.process_time() - begin)
+        seconds.append((np.mean(taken[:STEPS]), np.mean(taken[STEPS:])))
+        print(scenario, ", ".join(f"{1e3 * value:.1f} ms" for value in seconds[-1]))
+    print("mean", ", ".join(f"{1e3 * value:.1f} ms" for value in np.mean(seconds, 0)))
+
+
 def memory(arguments):
     env = EgoEnv(data="synthetic", split="validation", traffic="replay", action="bicycle")
     sizes = []
@@ -115,7 +134,8 @@ def resident_mb():
 DRIVE = """
 import sys, time
 from rlftsim.envs.drive import drive
-from rlftsim.envs.drive_scenario import DriveConfig
+from rlftsim.envs.drive_scenario import DriveConfig, make_environment
+from rlftsim.envs.planners.registry import load_planner
 planner, traffic, limit = sys.argv[1:]
 drive(DriveConfig(planner, traffic=(traffic,), limit=1))
 begin = time.process_time()
@@ -168,6 +188,11 @@ def main():
     one.add_argument("--rounds", type=int, default=3)
     one.add_argument("--model", default="demo-base")
     one.set_defaults(run=speed)
+    one = verbs.add_parser("steps")
+    one.add_argument("--data", required=True, help="logs of 40 s or more")
+    one.add_argument("--model", default="demo-tuned")
+    one.add_argument("--limit", type=int, default=3)
+    one.set_defaults(run=steps)
     one = verbs.add_parser("memory")
     one.add_argument("--episodes", type=int, default=2000)
     one.set_defaults(run=memory)

@@ -12,6 +12,9 @@ from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.result import build_animation
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.world import Dice, begin, build_world, step_world
+from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.entries import NoEntries
+from rlftsim.rollout.open_world import add_visitors
 from rlftsim.scenario.types import CURRENT_STEP, MapFeatureType
 from scenes import Mover, build_scenario, junction_map, light, polylines, raised, straight_map
 
@@ -68,6 +71,24 @@ def test_a_car_below_is_not_met_where_its_center_is_beside_the_road(aside_m, has
     drawn = build_scenario("aside", (EGO, beside), straight_map() if has_lanes else no_lanes)
     result = driven("replay", raised(drawn, lambda x: np.full_like(x, height_m), ROAD, (0,)))
     assert (len(result.record.collisions), result.planner.least_ttc_s < 3.0) == (meets, meets)
+
+
+class Busy(NoEntries):
+    def expect(self, gates):
+        return np.full(len(gates), 9.0)
+
+
+def test_who_enters_is_on_the_level_of_the_lane():
+    scenario = add_visitors(bridge(replace(EGO, speed_mps=0.0)))
+    world = build_world([scenario], load_policy("demo-base"), rules={"ego": "planner"}, entries=Busy())
+    state = begin(world, [Dice(0)])
+    for _ in range(30):
+        state = step_world(world, state, state.motion[:, 0])
+    entered = np.flatnonzero(~state.has_left[-1][0])[1:]
+    is_up = np.abs(state.motion[0, entered, 1] - state.motion[0, 0, 1]) < 8.0  # along the ego's road
+    assert 0 < is_up.sum() < len(entered)
+    ground = state.z[-1][0, entered] - world.height[0, entered] / 2
+    np.testing.assert_allclose(ground, np.where(is_up, 9.0, 3.0), atol=0.1)
 
 
 @pytest.mark.parametrize(("height_m", "meets"), [(1.5, True), (1.65, False), (2.4, False)])

@@ -16,12 +16,15 @@ from rlftsim.envs.drive_scenario import DriveConfig
 from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.route import find_route
-from rlftsim.envs.world import Dice, begin, build_world, step_world
+from rlftsim.envs.world import Dice, begin, build_world, find_presence, step_world
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives
 from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.entries import load_entries
+from rlftsim.rollout.open_world import EGO_GAP_M, add_visitors
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.open import to_scenarios
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightState
 from scenes import Mover, bend_map, build_scenario, junction_map, junction_with_light, light, straight_road
 
@@ -188,6 +191,113 @@ def test_gymnasium_and_pettingzoo_find_nothing_to_complain_about_at_600_steps():
     assert infos[-1]["result"].record.steps == 600
     agents = parallel_env(controlled="vehicles", **settings)
     parallel_api_test(agents, num_cycles=610)
+
+
+# ---- agents leave and enter ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    return to_scenarios("synthetic", "validation")[0]
+
+
+@pytest.fixture(scope="module")
+def open_env(policy, crossing):
+    """An environment after 15 s beside traffic that enters, and what the ego has seen."""
+    env = EgoEnv(scenarios=[crossing], policy=policy, max_steps=600, stop_on=(), entries="fixed-rate")
+    observations = [env.reset(seed=3)[0]]
+    for _ in range(150):
+        observations.append(env.step(STILL)[0])
+    return env, observations
+
+
+def test_an_open_world_that_the_policy_drives_alone_is_a_simulation(policy, crossing):
+    scenario, entries = add_visitors(crossing), load_entries("fixed-rate")
+    world = build_world([scenario], policy, rules={"*": "policy"}, max_steps=150, entries=entries)
+    state = begin(world, [Dice(5, 2)])
+    for _ in range(150):
+        state = step_world(world, state, np.zeros((0, 5)))
+    reference = simulate(
+        policy, collate([scenario]), num_rollouts=range(2, 3), seed=5, num_steps=150, entries=entries
+    )  # fmt: skip
+    track = np.stack([step[0] for step in state.track[CURRENT_STEP + 1 :]], 1)
+    valid = reference.valid[0, 0].numpy()
+    np.testing.assert_array_equal(track[..., :2].astype(np.float32), reference.position[0, 0].numpy())
+    np.testing.assert_array_equal(find_presence(world, state)[0][0, :, CURRENT_STEP + 1 :], valid)
+    assert (valid[:, 1:] & ~valid[:, :-1]).any()
+    assert np.linalg.norm(track[valid][:, 3:], axis=-1).max() < 30.0  # who enters has not jumped
+
+
+def test_the_ego_sees_who_enters_and_nobody_with_the_past_of_another(open_env):
+    env, observations = open_env
+    record = env.result().record
+    is_present, position = record.is_present, record.motion[..., :2]
+    entered, steps = np.nonzero(is_present[:, 1:] & ~is_present[:, :-1])
+    distance = np.linalg.norm(position - position[record.agent], axis=-1)
+    assert len(entered)
+    assert distance[entered, steps + 1].min() > EGO_GAP_M
+    assert (is_present[:, :-1] & ~is_present[:, 1:]).any()
+    for step in (0, steps[0], steps[0] + 1, 150):
+        others = np.delete(is_present[:, step], record.agent).sum()
+        shown = observations[step]["neighbors_mask"]
+        assert shown.sum() == min(others, len(shown))
+    for observation in observations:
+        nearby = observation["neighbors_mask"].astype(bool)
+        past = observation["neighbors_history"].reshape(len(nearby), -1, 4)
+        history = np.concatenate([past, observation["neighbors"][:, None, :4]], 1)[nearby]
+        is_seen = (history != 0).any(-1)
+        moved = np.linalg.norm(np.diff(history[..., :2], axis=1), axis=-1)
+        assert moved[is_seen[:, 1:] & is_seen[:, :-1]].max(initial=0.0) < 4.0
+
+
+def test_open_worlds_are_forked_and_stored_bit_for_bit(open_env, policy, crossing):
+    env, observations = open_env
+    same, other = env.fork(1)[0], env.fork(1, noise="new")[0]
+    restored = EgoEnv(scenarios=[crossing], policy=policy, max_steps=600, stop_on=(), entries="fixed-rate")
+    seen, _ = restored.restore(env.snapshot())
+    for name, values in observations[-1].items():
+        np.testing.assert_array_equal(seen[name], values)
+    for branch in (same, other, restored):
+        for _ in range(60):
+            branch.step(np.array([-1.0, 0.0], np.float32))
+    presence = [np.stack(branch.state.world.has_left) for branch in (same, restored, other)]
+    np.testing.assert_array_equal(presence[0], presence[1])
+    np.testing.assert_array_equal(same.state.world.motion, restored.state.world.motion)
+    assert not np.array_equal(presence[0], presence[2])
+    closed = EgoEnv(scenarios=[crossing], policy=policy, max_steps=600, stop_on=())
+    with pytest.raises(ConfigError, match="another entries"):
+        closed.restore(env.snapshot())
+
+
+def test_the_checkers_find_nothing_to_complain_about_where_agents_enter(policy, crossing):
+    settings = {"scenarios": [crossing], "policy": policy, "max_steps": 600, "entries": "fixed-rate"}
+    check_env(EgoEnv(**settings), skip_render_check=True)
+    parallel_api_test(parallel_env(controlled=[int(crossing.tracks.object_id[crossing.ego_index])], **settings), 100)
+
+
+def test_entries_need_traffic_that_follows_a_policy(policy):
+    road = straight_road()
+    for settings in ({"traffic": "idm"}, {"drivers": {"pedestrians": "replay"}}):
+        with pytest.raises(ConfigError, match="needs traffic that follows the policy"):
+            EgoEnv(scenarios=[road], policy=policy, entries="none", **settings)
+    with pytest.raises(ConfigError, match="named one by one"):
+        parallel_env(scenarios=[road], policy=policy, controlled="vehicles", entries="none")
+    with pytest.raises(ConfigError, match="take a SMART model"):
+        EgoEnv(scenarios=[road], model="constant_velocity", entries="none")
+    with pytest.raises(ConfigError, match="entries=none has no effect: add policy"):
+        DriveConfig("idm", traffic=("replay",), entries="none")
+
+
+def test_drives_with_and_without_entries_are_not_taken_for_each_other(tmp_path, capsys):
+    command = ["drive", "idm", "--data", "synthetic", "--limit", "1", "--seconds", "2", "--out", str(tmp_path)]
+    assert main([*command, "--entries", "none", "--film", "first"]) == 0
+    printed = capsys.readouterr().out.replace("\n", "")
+    assert "idm in policy: no others_realism, agents leave and enter" in printed
+    assert len([*tmp_path.glob("*.webp")]) == 1  # beside replayed traffic, where nobody enters
+    closed = DriveResult.read(tmp_path / "idm-replay.parquet").settings
+    assert (closed.entries, DriveResult.read(tmp_path / "idm-policy.parquet").settings.entries) == (None, "none")
+    assert main(command) == 2
+    assert "another entries" in capsys.readouterr().err
 
 
 def test_a_token_may_end_after_the_last_step(policy):

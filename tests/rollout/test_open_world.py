@@ -187,8 +187,12 @@ def test_lights_of_the_log_are_seen_after_eight_seconds(monkeypatch):
     assert torch.equal(now.scene.map_features, policy.encode(batch).scene.map_features)
     steps, encode = [], type(policy).encode
     monkeypatch.setattr(type(policy), "encode", lambda self, b: steps.append(b.light_step) or encode(self, b))
-    assert simulate(policy, collate([junction]), num_rollouts=1, seed=0, num_steps=100).position.isfinite().all()
-    assert steps == [10, 90]
+    kept = simulate(policy, collate([junction]), num_rollouts=1, seed=0, num_steps=100)
+    assert steps == [10]  # maps are not encoded anew
+    monkeypatch.delattr(type(policy), "relight")
+    anew = simulate(policy, collate([junction]), num_rollouts=1, seed=0, num_steps=100)
+    assert steps == [10, 10, 90]
+    assert torch.allclose(kept.position, anew.position, atol=1e-3)
 
 
 def test_a_calibrated_model_sees_a_newcomer_by_where_it_drives():

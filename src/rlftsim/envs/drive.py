@@ -27,6 +27,7 @@ from rlftsim.jobs.items import ResultFormat, group_positions, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
+from rlftsim.rollout.entries import identify_entries
 from rlftsim.scenario.dataset import dataset_folder
 
 
@@ -57,7 +58,9 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         "manifest_sha256": hash_manifest(dataset_folder(config.data)),
     }  # fmt: skip
     drive_settings = [
-        DriveSettings(traffic=traffic, model=env.source.fingerprint, **common_settings)
+        DriveSettings(
+            traffic=traffic, model=env.source.fingerprint, entries=_identify_entries(config, traffic), **common_settings
+        )
         for traffic, env in zip(config.traffic, environments)
     ]
     # processes hand their rows over in files, so even results that are not kept need a folder
@@ -68,6 +71,11 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         for settings, path in zip(drive_settings, paths):
             _read_and_refuse(config, settings, ids, path)
         return [_drive_traffic(config, settings, ids, path) for settings, path in zip(drive_settings, paths)]
+
+
+def _identify_entries(config: DriveConfig, traffic: str) -> str | None:
+    entries = config.find_entries(traffic)
+    return None if entries is None else identify_entries(entries)
 
 
 def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult | None:

@@ -47,6 +47,8 @@ class DriveConfig:
     seed: int = 0
     seconds: float = 8.0
     """Length of the episodes."""
+    entries: str | None = None
+    """Model of who enters traffic "policy", see `EnvConfig.entries`."""
     limit: int | None = None
     """Only the first so many scenarios."""
     scenarios: tuple[str, ...] | None = None
@@ -68,6 +70,8 @@ class DriveConfig:
                 raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
         if len(set(self.traffic)) < len(self.traffic):
             raise ConfigError(f"traffic names a type twice: {', '.join(self.traffic)}.")
+        if self.entries is not None and "policy" not in self.traffic:
+            raise ConfigError(f"entries={self.entries} has no effect: add policy to the traffic, or leave it out.")
         if self.film is not None and not FILMS.fullmatch(self.film):
             raise ConfigError(f"film must be first, failures, or worst:N such as worst:5, got {in_short(self.film)}.")
 
@@ -75,8 +79,13 @@ class DriveConfig:
         """Settings of the environment for a type of traffic: no event ends an episode, and no reward is given."""
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic), stop_on=(),
-            reward="none", max_steps=count_steps(self.seconds), **read_action_settings(load_planner(self.planner)),
+            entries=self.find_entries(traffic), reward="none", max_steps=count_steps(self.seconds),
+            **read_action_settings(load_planner(self.planner)),
         )  # fmt: skip
+
+    def find_entries(self, traffic: str) -> str | None:
+        """Model of who enters a type of traffic; None = nobody."""
+        return self.entries if traffic == "policy" else None
 
     def count_side_by_side(self, traffic: str, num_scenarios: int) -> int:
         """Number of scenarios that are driven at once, such that every process has some.

@@ -249,7 +249,10 @@ def _step(
     previous = own_motion(episode, state.world)
     world = step_world(episode.world, state.world, moved)
     # 1. contacts with tracks that have not been touched
-    contacts = _contacts(episode, world, moved) & ~state.touched
+    touched = state.touched
+    if world.has_left:  # others take the rows of those that have left
+        touched = touched & ~world.has_left[-1][episode.world.actors[:, 0]]
+    contacts = _contacts(episode, world, moved) & ~touched
     collisions, (new_collisions, at_fault) = list(state.collisions), np.zeros((2, episode.num_agents))
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
         scene, _ = episode.world.actors[row]
@@ -283,7 +286,7 @@ def _step(
         "goal": (at_goal & ~state.at_goal).astype(float),
     }
     following = EpisodeState(
-        world, state.touched | contacts, tuple(collisions), outside, at_goal, clear, progress, state.ended
+        world, touched | contacts, tuple(collisions), outside, at_goal, clear, progress, state.ended
     )
     return following, terms
 

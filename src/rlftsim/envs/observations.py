@@ -262,6 +262,9 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         return offset * rotation if frame == "ego" else offset + position
 
     is_present = find_presence(world, state, HISTORY + 1)[0]  # [B, A, 11]
+    if world.open_worlds:  # before it entered an agent's row was somebody else's
+        has_left = np.stack(state.has_left[-HISTORY - 1 :], -1)
+        is_present = is_present & ~np.maximum.accumulate(has_left[..., ::-1], -1)[..., ::-1]
 
     # 1. Squared distances, infinite where there is nothing to see.
     squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]

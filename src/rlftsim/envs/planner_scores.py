@@ -131,6 +131,8 @@ def missing_scores(record: Record) -> dict[str, str]:
     reasons, log_steps = {}, record.scene.scenario.num_steps - HISTORY_STEPS
     if record.steps > FUTURE_STEPS:
         reasons["others_realism"] = f"the metric compares {FUTURE_STEPS * STEP_S:g} s"
+    elif record.is_open:
+        reasons["others_realism"] = "agents leave and enter, which the metric does not compare"
     if record.steps > FUTURE_STEPS and record.has_left_map:
         reasons[f"scores beyond {record.steps * STEP_S:.1f} s"] = "the map ends there"
     if not record.scene.scenario.has_future:

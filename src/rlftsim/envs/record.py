@@ -39,6 +39,8 @@ class Record:
     """True = the planner's agent is beyond the end of the map."""
     traffic: str
     """Driver of the other agents: name of the model, or type of traffic."""
+    is_open: bool = False
+    """True = agents leave and enter."""
 
     @property
     def steps(self) -> int:
@@ -105,4 +107,5 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         logged_route=find_route(scene.scenario, agent, "logged", scene.num_steps),
         has_left_map=bool(has_left_map(episode, state.world)[row]),
         traffic=episode.config.model if episode.config.traffic == "policy" else episode.config.traffic,
+        is_open=bool(episode.world.open_worlds),
     )

@@ -70,14 +70,19 @@ def to_scene_motion(record: Record, agents: AgentBoxes) -> SceneMotion:
         agents: Boxes of the same agents, for marks of overlaps.
     """
     log = logged_trajectories(record.scene.scenario)
-    position = np.concatenate([log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]], 1)
-    heading = np.concatenate([log.heading[0, :, :HISTORY_STEPS], record.motion[:, 1:, 2]], 1)
-    valid = np.concatenate([log.valid[0, :, :HISTORY_STEPS], record.is_present[:, 1:]], 1)
-    motion = SceneMotion(position[None].astype(np.float32), heading[None].astype(np.float32), valid[None])
+
+    def join(past: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """[1, A, S, ...], with absent rows where other records have agents that enter."""
+        joined = np.concatenate([past, values], 1)
+        return np.pad(joined, ((0, len(agents) - len(joined)), *((0, 0),) * (joined.ndim - 1)))[None]
+
+    position = join(log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]).astype(np.float32)
+    heading = join(log.heading[0, :, :HISTORY_STEPS], record.motion[:, 1:, 2]).astype(np.float32)
+    motion = SceneMotion(position, heading, join(log.valid[0, :, :CURRENT_STEP], record.is_present))
     if record.scene.levels is None:
         return motion.with_overlaps(agents)
-    z = np.concatenate([record.scene.logged_z[:, :HISTORY_STEPS], record.z[:, 1:]], 1)
-    return motion.with_overlaps(agents, z[None], record.scene.size[:, 2])
+    height = np.pad(record.scene.size[:, 2], (0, len(agents) - len(record.z)))
+    return motion.with_overlaps(agents, join(record.scene.logged_z[:, :HISTORY_STEPS], record.z[:, 1:]), height)
 
 
 def build_animation(records: Mapping[str, Record], scores: Sequence[float] | None = None) -> Animation:
@@ -87,7 +92,8 @@ def build_animation(records: Mapping[str, Record], scores: Sequence[float] | Non
         records: Title to record, at least one, all of the same scenario.
         scores: Score of each record in [0, 1], which films show with time, speed and traffic; None = no such text.
     """
-    scenario = next(iter(records.values())).scene.scenario
+    # where agents enter, a scenario has further rows
+    scenario = max((record.scene.scenario for record in records.values()), key=lambda s: len(s.simulated_indices))
     scene = build_scene(scenario)
     panels = []
     for index, (title, record) in enumerate(records.items()):

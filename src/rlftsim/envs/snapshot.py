@@ -22,6 +22,7 @@ from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, DataError, check_types, in_short
 from rlftsim.jobs.documents import parse_json
+from rlftsim.rollout.entries import identify_entries
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, STEP_S
 
 FORMAT = "rlftsim-snapshot-1"
@@ -162,4 +163,6 @@ def _parse_dice(rows: list[Any], num_steps: int, episode: Episode) -> list[tuple
 def _settings(episode: Episode) -> dict[str, Any]:
     """Settings that an episode depends on, as JSON has them."""
     settings = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
+    if settings["entries"] is not None:
+        settings["entries"] = identify_entries(settings["entries"])
     return parse_json(json.dumps(settings), "give plain values", source="settings of the environment")

@@ -10,13 +10,16 @@ import torch
 
 from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.drivers import GROUPS
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.sumo_traffic import check_sumo
 from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.entries import load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.open_world import add_visitors, check_decisions
 from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import dataset_folder
@@ -82,6 +85,15 @@ class Source:
         self.policy = (
             policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
         )
+        self.entries = None if config.entries is None else load_entries(config.entries)
+        if self.entries is not None:
+            groups = {driver for who, driver in self.rules.items() if who in GROUPS or who == "*"}
+            if self.policy is None or groups != {"policy"} or not {*self.rules.values()} <= {"planner", "policy"}:
+                raise ConfigError(
+                    f"entries={config.entries} needs traffic that follows the policy, and a planner whose agents are "
+                    "named one by one: leave out other drivers, or entries."
+                )
+            check_decisions(self.policy.steps_per_decision)
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
         self.controls: Controls = build_controls(
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
@@ -116,11 +128,13 @@ class Source:
         """
         if goals and (self.policy is None or not is_goal_conditioned(self.policy)):
             raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
+        if self.entries is not None:
+            scenarios = [add_visitors(scenario) for scenario in scenarios]
         num_actions = math.ceil(self.config.max_steps / self.controls.steps)
         world = build_world(
             scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
             context=self._context(scenarios), data=dataset_folder(self.config.data),
-            max_steps=num_actions * self.controls.steps,
+            max_steps=num_actions * self.controls.steps, entries=self.entries,
         )  # fmt: skip
         if not len(world.actors):
             raise ConfigError(

@@ -58,7 +58,8 @@ def score_traffic(record: Record, least_ttc_s: float) -> TrafficScores:
         least_ttc_s: Least time to collision of the planner's agent, as `PlannerScores` has it, s.
     """
     scene, motion = record.scene, record.motion
-    is_traffic = np.arange(len(scene.object_id)) != record.agent
+    # rows into which nobody has entered are no agents
+    is_traffic = (np.arange(len(scene.object_id)) != record.agent) & record.is_observed.any(1)
     is_vehicle = is_traffic & (scene.object_type == ObjectType.VEHICLE)
     has_edges, has_lanes = (find(scene.scenario) is not None for find in (road_edges, lane_search))
     # 1. contacts among the others; those that begin with an overlap do not count
@@ -120,7 +121,9 @@ def _leaves_road(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.nda
         states = Trajectories(*torch.from_numpy(pose[:, agents]).float()[:, None])
         size = torch.from_numpy(scene.size[agents, None]).float()
         off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy() >= OUTSIDE_M
-        leaves[agents] = ~off[:, 0] & (off & record.is_observed[agents]).any(1)
+        is_observed = record.is_observed[agents]
+        begins_off = np.take_along_axis(off, is_observed.argmax(1)[:, None], 1)[:, 0]
+        leaves[agents] = ~begins_off & (off & is_observed).any(1)
     return leaves
 
 
@@ -173,7 +176,7 @@ def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = ME
     """
     scene = records[0].scene
     scenario = _leave_out_ego(scene.scenario)
-    has_all_steps = all(record.steps == FUTURE_STEPS for record in records)
+    has_all_steps = all(record.steps == FUTURE_STEPS and not record.is_open for record in records)
     if not (scenario.has_evaluated_future and has_all_steps) or road_edges(scene.scenario) is None:
         return float("nan")
     motion = torch.from_numpy(np.stack([record.motion[:, 1:] for record in records]))  # [N, A, 80, 5]

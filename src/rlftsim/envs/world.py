@@ -14,7 +14,7 @@ Shapes: B scenes, A agents (padded), M agents that a planner drives, over all sc
 seconds. Motion: x, y, heading, vx, vy.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +32,9 @@ from rlftsim.envs.sumo_traffic import SumoScene, SumoState, advance_sumo, begin_
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.threads import one_thread
+from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
+from rlftsim.rollout.open_world import OpenWorld, Presence, make_rng
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import encode_lights
 from rlftsim.rollout.types import AgentStates
@@ -88,6 +90,8 @@ class World:
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
     """True = heights count in the scene, see `levels`."""
+    open_worlds: tuple[OpenWorld, ...] = ()
+    """Of each scene where agents leave and enter; else empty."""
 
     @cached_property
     def agents(self) -> dict[Driver, tuple[np.ndarray, np.ndarray]]:
@@ -114,6 +118,18 @@ class Block:
     """None before the first block."""
     poses: Float[np.ndarray, "B A k 3"] | None
     """The poses they lead to."""
+    presences: tuple[Presence, ...] = ()
+    """Who is there in each scene where agents leave and enter."""
+
+    @property
+    def is_imposed(self) -> Bool[np.ndarray, "B A"]:
+        """True = the policy does not move the agent, since it is absent, parked or enters."""
+        return np.concatenate([presence.is_imposed for presence in self.presences])
+
+    @property
+    def is_absent(self) -> Bool[np.ndarray, "B A"]:
+        """True = the agent is not there, in scenes where agents leave and enter."""
+        return ~np.concatenate([presence.is_present for presence in self.presences])
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +174,7 @@ def build_world(
     context: Any = None,
     data: Path | None = None,
     max_steps: int = FUTURE_STEPS,
+    entries: EntryModel | None = None,
 ) -> World:
     """The world of some scenarios, which step together.
 
@@ -170,6 +187,8 @@ def build_world(
         context: Result of `policy.encode` for these scenarios; None = computed here.
         data: Folder of the data set, which has the worlds that SUMO runs again.
         max_steps: Largest number of steps; replayed agents are gone after their log's end, and lights hold.
+        entries: Model of who enters scenarios with visitors (`open_world.add_visitors`), in which all agents but the
+            planner's follow the policy; None = nobody enters or leaves.
 
     Raises:
         ConfigError: a rule that does not fit, or agents that follow the policy where `policy` is left out.
@@ -198,6 +217,10 @@ def build_world(
     simulated = (drivers != Driver.REPLAY)[..., None]
     is_present = mask[..., None] & (simulated | goes_on)
     is_present[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
+    driven = [
+        np.flatnonzero((row == Driver.PLANNER) | (np.arange(shape[1]) == scene.ego))
+        for row, scene in zip(drivers, scenes)
+    ]
     idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
     return World(
         scenes=scenes,
@@ -222,7 +245,11 @@ def build_world(
         sampling=sampling,
         lines=tuple(build_idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
         sumo_scenes=tuple(build_sumo_scene(scene, data) for scene in by_sumo if data is not None),
-    )
+        open_worlds=tuple(
+            OpenWorld(scene.scenario, shape[1], entries, rows)
+            for scene, rows in zip(scenes, driven) if entries is not None
+        ),
+    )  # fmt: skip
 
 
 def padded(arrays: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
@@ -250,7 +277,9 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     if world.policy is not None:
         initial = _noise(world, dice, "begin", world.policy.initial_noise_size)
         with one_thread(), torch.no_grad():
-            block = Block(world.policy.begin(world.context, 1, world.goals, initial), world.context, None, None)
+            policy_state = world.policy.begin(world.context, 1, world.goals, initial)
+        presences = tuple(open_world.begin(1) for open_world in world.open_worlds)
+        block = Block(policy_state, world.context, None, None, presences)
         noise = _decision_noise(world, dice, 0)
     idm_states = tuple(begin_idm(lines, scene) for scene, lines in zip(world.scenes, world.lines))
     track = tuple(world.logged_steps[: CURRENT_STEP + 1].copy())
@@ -258,6 +287,8 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     sumo_states = tuple(begin_sumo(sumo_scene, scene) for sumo_scene, scene in zip(world.sumo_scenes, world.scenes))
     leaves = bool(world.sumo_scenes) or any(np.isfinite(lines.exit_m).any() for lines in world.lines)
     has_left = (np.zeros(world.mask.shape, bool),) * (len(track) if leaves else 0)
+    if block is not None and block.presences:
+        has_left = (block.is_absent,) * len(track)
     return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states, has_left)
 
 
@@ -282,8 +313,12 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
             block = _decide(world, state)
             dice = (*dice, dice[-1])
         assert block.poses is not None
-        poses = block.poses[:, :, state.step % world.policy.steps_per_decision]
-        velocity = (poses[..., :2] - previous[..., :2]) / STEP_S
+        block_step = state.step % world.policy.steps_per_decision
+        poses, before = block.poses[:, :, block_step], previous[..., :2]
+        if block.presences and block_step == 0:  # who enters was elsewhere
+            ahead = block.poses[:, :, 1, :2] - poses[..., :2]
+            before = np.where(block.is_imposed[..., None], poses[..., :2] - ahead, before)
+        velocity = (poses[..., :2] - before) / STEP_S
         follows = world.agents[Driver.POLICY]
         motion[follows] = np.concatenate([poses, velocity], -1)[follows]
     coasts = world.agents[Driver.CONSTANT_VELOCITY]
@@ -312,10 +347,16 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         sumo_states.append(sumo_state)
     # 4. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
-    z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
+    z = state.z[-1]
+    if world.has_levels.any():
+        if block is not None and block.presences:
+            z = _find_entry_heights(world, z, motion, state.has_left[-1] & ~block.is_absent)
+        z = _follow_levels(world, z, motion, following)
     # 5. those that have left
     has_left = state.has_left
-    if has_left:
+    if block is not None and block.presences:
+        has_left = (*has_left, block.is_absent)
+    elif has_left:
         left = has_left[-1].copy()
         for b, (lines, idm_state) in enumerate(zip(world.lines, idm_states)):
             left[b, lines.agents] |= idm_state[:, 0] >= lines.exit_m
@@ -371,6 +412,18 @@ def _follow_levels(
     return np.where(is_replayed, world.logged_z[:, :, step], z)
 
 
+def _find_entry_heights(
+    world: World, z: Float[np.ndarray, "B A"], motion: Float[np.ndarray, "B A 5"], enters: Bool[np.ndarray, "B A"]
+) -> Float[np.ndarray, "B A"]:
+    """Heights of the centers, those of agents that enter on the nearest lane."""
+    z = z.copy()
+    for b, agent in np.argwhere(enters):
+        lanes = world.scenes[b].lanes
+        nearest = np.square(lanes.points - motion[b, agent, :2]).sum(-1).argmin()
+        z[b, agent] = lanes.z.flat[nearest] + world.height[b, agent] / 2
+    return z
+
+
 def fork(world: World, state: WorldState, number: int, noise: Noise = "same") -> tuple[WorldState, ...]:
     """States that go on from the same state: only the noise of the decisions to come is copied.
 
@@ -420,14 +473,31 @@ def _decide(world: World, state: WorldState) -> Block:
         distribution = policy.decide(context, policy_state)
         index = state.step % FUTURE_STEPS // policy.steps_per_decision
         decision = distribution.sample(world.sampling, state.noise[..., index, :])
-        poses = policy.advance(context, policy_state, decision).poses
-    return Block(policy_state, context, decision, poses[:, 0].cpu().numpy().astype(np.float64))
+        presences, imposed = tuple(_find_presences(world, state)), None
+        if presences:
+            states = [presence.impose(world.batch.device) for presence in presences]
+            imposed = AgentStates(*(torch.cat(values) for values in zip(*(vars(state).values() for state in states))))
+        poses = policy.advance(context, policy_state, decision, imposed).poses
+    return Block(policy_state, context, decision, poses[:, 0].cpu().numpy().astype(np.float64), presences)
+
+
+def _find_presences(world: World, state: WorldState) -> Iterator[Presence]:
+    """Who is there in each scene during the next block, where agents leave and enter."""
+    assert state.block is not None
+    for b, (open_world, presence) in enumerate(zip(world.open_worlds, state.block.presences)):
+        motion, dice = state.motion[b : b + 1], state.dice[-1][b]
+        rng = make_rng(dice.seed, open_world.scenario_id, dice.rollout, state.step)
+        # positions as the policy has them
+        pose = motion[..., :3].astype(np.float32).astype(np.float64)
+        yield open_world.step(presence, pose, motion[..., 3:], [rng])
 
 
 def _forced(world: World, state: WorldState) -> AgentStates | None:
     """Last block's motion of the agents that the policy does not drive; None where the policy drives all."""
     assert world.policy is not None
     imposed = world.mask & (world.drivers != Driver.POLICY)
+    if state.block is not None and state.block.presences:
+        imposed |= state.block.is_imposed
     if not imposed.any():
         return None
     steps = world.policy.steps_per_decision

@@ -61,6 +61,8 @@ class DriveSettings:
     """Hash of the file that defines the planner."""
     manifest_sha256: str = ""
     """Hash of the data set's manifest."""
+    entries: str | None = None
+    """Name, or hash of the file, of the model of who enters; None = nobody enters or leaves."""
 
     def what_counts(self) -> dict[str, object]:
         """The values that results of the same episodes share; the manifest identifies a data set that was moved."""
@@ -116,7 +118,8 @@ class DriveResult:
 
     def write(self, path: str | PathLike[str]) -> None:
         """Write as Parquet, whole or not at all."""
-        about = {"format": FORMAT, "settings": asdict(self.settings), "missing": self.missing}
+        settings = {name: value for name, value in asdict(self.settings).items() if (name, value) != ("entries", None)}
+        about = {"format": FORMAT, "settings": settings, "missing": self.missing}
         table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
         write_atomically(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
@@ -220,6 +223,7 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
     know_content = a.settings.manifest_sha256 and b.settings.manifest_sha256
     compared = {name: name for name in ("num_rollouts", "seed", "split", "seconds")}
     compared["dataset"] = "manifest_sha256" if know_content else "dataset"
+    compared |= {"entries": "entries"} if a.settings.traffic == b.settings.traffic else {}
     for label, setting in compared.items():
         if getattr(a.settings, setting) != getattr(b.settings, setting):
             value_a, value_b = getattr(a.settings, label), getattr(b.settings, label)

@@ -7,12 +7,12 @@ N rollouts, A agents, visitors included. Map frame, meters.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
@@ -21,7 +21,7 @@ from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, Gates, find_region
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario, Tracks
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario, Tracks, cached_on_scenario
 
 WAITING_M, WAITING_GAP_M = 20_000.0, 60.0
 """Distance of absent agents from the origin, and from one another."""
@@ -52,6 +52,7 @@ STRAIGHT_M = np.arange(0.0, LOOK_M, 2.0)
 """Points of the way of those that follow no lane."""
 
 
+@cached_on_scenario
 def add_visitors(scenario: Scenario) -> Scenario:
     """The scenario with rows for agents that may enter, which wait outside of the map; a row has one type and size."""
     tracks = scenario.tracks
@@ -61,6 +62,7 @@ def add_visitors(scenario: Scenario) -> Scenario:
     position = np.zeros((*shape, 3), np.float32)
     position[..., 0] = scenario.origin[0] + WAITING_M + WAITING_GAP_M * np.arange(len(types))[:, None]
     position[..., 1] = scenario.origin[1] + WAITING_M
+    position[..., 2] = tracks.position[scenario.ego_index, CURRENT_STEP, 2]
     visitors = Tracks(
         object_id=tracks.object_id.max() + 1 + np.arange(len(types)),
         object_type=types,
@@ -91,8 +93,165 @@ def check_decisions(steps_per_decision: int) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Presence:
+    """Who is there in N rollouts of a scenario during half a second."""
+
+    is_present: Bool[np.ndarray, "N A"]
+    is_parked: Bool[np.ndarray, "N A"]
+    num_turned_away: tuple[int, ...]
+    """Agents that found no room, in each rollout."""
+    is_imposed: Bool[np.ndarray, "N A"]
+    """True = the agent is absent, parked or enters, and the policy does not move it."""
+    path: Float[np.ndarray, "N A 5 3"]
+    """Poses of the agents that are imposed."""
+
+    def impose(self, device: torch.device) -> AgentStates:
+        """The imposed states, of a single scenario."""
+        path = torch.from_numpy(self.path[None]).float().to(device)
+        valid = torch.from_numpy(self.is_imposed)[None, :, :, None].to(device)
+        return AgentStates(path[..., :2], path[..., 2], valid.expand(path.shape[:-1]))
+
+
+def make_rng(seed: int, scenario_id: str, rollout: int, step: int) -> np.random.Generator:
+    """Generator of who enters in half a second of a rollout."""
+    return np.random.default_rng(derive_seed(seed, "entries", scenario_id, rollout, step))
+
+
 class OpenWorld:
-    """Who is there in N rollouts of a scenario.
+    """Decides who is there in rollouts of a scenario; holds nothing that changes.
+
+    Args:
+        scenario: Scenario with visitors (`add_visitors`).
+        num_agents: Number A of agents, with padding, which comes behind the visitors.
+        entries: Model of who enters.
+        driven: Rows that stay, and that nobody enters near; None = the ego.
+    """
+
+    def __init__(
+        self, scenario: Scenario, num_agents: int, entries: EntryModel, driven: Int64[np.ndarray, "M"] | None = None
+    ):
+        self.scenario_id, self.entries, self.region_m = scenario.scenario_id, entries, find_region_m(scenario)
+        self.finder, simulated = GateFinder(scenario), scenario.simulated_indices
+        self.ego = int(np.flatnonzero(simulated == scenario.ego_index)[0])
+        self.driven = np.array([self.ego]) if driven is None else driven
+        self.object_type = np.zeros(num_agents, np.int64)
+        self.object_type[: len(simulated)] = scenario.tracks.object_type[simulated]
+        self.first_visitor = len(simulated) - sum(VISITORS.values())
+        self.waiting = np.zeros((num_agents, 3))
+        self.waiting[:, 0] = WAITING_M + WAITING_GAP_M * (np.arange(num_agents) - self.first_visitor)
+        self.waiting[:, 1] = WAITING_M
+
+    def begin(self, num_rollouts: int) -> Presence:
+        """Presence before the first decision: all agents of the log, and no visitor."""
+        is_present = np.broadcast_to(
+            np.arange(len(self.waiting)) < self.first_visitor, (num_rollouts, len(self.waiting))
+        )
+        path = np.broadcast_to(self.waiting[:, None], (*is_present.shape, DECISION_STEPS, 3))
+        return Presence(is_present, np.zeros_like(is_present), (0,) * num_rollouts, ~is_present, path)
+
+    def step(
+        self,
+        presence: Presence,
+        pose: Float[np.ndarray, "N A 3"],
+        velocity: Float[np.ndarray, "N A 2"],
+        rngs: Sequence[np.random.Generator],
+    ) -> Presence:
+        """Presence in the half second that begins.
+
+        Args:
+            presence: Presence in the half second before.
+            pose: Present poses of all agents.
+            velocity: Present velocities, m/s.
+            rngs: Generators of who enters each rollout, see `make_rng`.
+        """
+        is_present = presence.is_present & ~self._find_leaving(pose)
+        is_parked, num_turned_away = presence.is_parked & is_present, []
+        path = np.repeat(np.broadcast_to(self.waiting, pose.shape)[:, :, None], DECISION_STEPS, 2)  # [N, A, 5, 3]
+        path[is_parked] = pose[is_parked][:, None]
+        is_imposed = ~is_present | is_parked
+        for n, rng in enumerate(rngs):
+            # who leaves now is away for half a second at least
+            entered, num_left_out = self._enter(
+                rng, pose[n], velocity[n], is_present[n], ~presence.is_present[n], presence.num_turned_away[n]
+            )
+            num_turned_away.append(num_left_out)
+            for agent, steps, parks in entered:
+                path[n, agent], is_imposed[n, agent] = steps, True
+                is_present[n, agent], is_parked[n, agent] = True, parks
+        return Presence(is_present, is_parked, tuple(num_turned_away), is_imposed, path)
+
+    def _find_leaving(self, pose: Float[np.ndarray, "N A 3"]) -> Bool[np.ndarray, "N A"]:
+        """True beyond the border, and at the end of a lane that goes on nowhere."""
+        away = np.linalg.norm(pose[..., :2] - pose[:, self.ego, None, :2], axis=-1) > self.region_m + BEYOND_BORDER_M
+        if len(self.finder.ends):
+            to_end = np.linalg.norm(pose[:, :, None, :2] - self.finder.ends, axis=-1).min(-1)
+            away |= (to_end < AT_END_M) & (self.object_type == ObjectType.VEHICLE)
+        away[:, self.driven] = False
+        return away
+
+    def _enter(
+        self,
+        rng: np.random.Generator,
+        pose: Float[np.ndarray, "A 3"],
+        velocity: Float[np.ndarray, "A 2"],
+        present: Bool[np.ndarray, "A"],
+        is_free: Bool[np.ndarray, "A"],
+        num_turned_away: int,
+    ) -> tuple[list[tuple[int, Float[np.ndarray, "5 3"], bool]], int]:
+        """Row and poses of each agent that enters a rollout, and True for vehicles parked beside the lane; and the
+        number of those that found no room.
+        """
+        gates = self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m)
+        rate = self.entries.expect(gates)
+        rate = rate * (1 + num_turned_away / max(rate.sum(), 1e-6))
+        gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-rate)))
+        entrants = self.entries.draw(gates, rng)
+        free = {int(name): np.flatnonzero(is_free & (self.object_type == name)).tolist() for name in VISITORS}
+        others, others_velocity = pose[present, :2], velocity[present]
+        entered = []
+        for k in range(len(gates)):
+            chosen = self._choose_pose(gates, entrants, k)
+            if chosen is None:
+                continue
+            position, heading, is_parked = chosen
+            along, wanted_mps = np.array([np.cos(heading), np.sin(heading)]), float(entrants.speed_mps[k])
+            route = position + STRAIGHT_M[:, None] * along, STRAIGHT_M
+            if entrants.object_type[k] == ObjectType.VEHICLE and not is_parked:
+                route = self.finder.follow(int(gates.point[k]), LOOK_M)
+            speed = find_safe_speed(position, along, wanted_mps, others, others_velocity, *route)
+            rows = free.get(int(entrants.object_type[k]), [])
+            to_driven = np.linalg.norm(pose[self.driven, :2] - position, axis=-1)
+            if speed is None or not rows or (to_driven < EGO_GAP_M).any():
+                continue
+            times = STEP_S * np.arange(1, DECISION_STEPS + 1)[:, None]
+            path = np.concatenate([position + times * speed * along, np.full((DECISION_STEPS, 1), heading)], -1)
+            entered.append((rows.pop(), path, is_parked))
+            others, others_velocity = np.vstack([others, position]), np.vstack([others_velocity, speed * along])
+        return entered, min(len(gates) - len(entered), MOST_TURNED_AWAY)
+
+    def _choose_pose(
+        self, gates: Gates, entrants: Entrants, k: int
+    ) -> tuple[Float[np.ndarray, "2"], float, bool] | None:
+        """Position and heading of an entrant, and True for one that is parked; None where it would block a lane."""
+        lane, left, turn = gates.position[k], float(entrants.left_m[k]), float(entrants.turn_rad[k])
+        side = np.array([-np.sin(gates.heading[k]), np.cos(gates.heading[k])])
+        is_vehicle = entrants.object_type[k] == ObjectType.VEHICLE
+        if is_vehicle and (abs(left) <= PARKED_M or entrants.speed_mps[k] >= PARKED_MPS):
+            return lane, float(gates.heading[k]), False
+        # a place to park may be on a lane of this road, then it is the side of the gate's lane
+        for offset in (left, -ROADSIDE_M) if is_vehicle else ():
+            if not self._is_on_lane(lane + offset * side):
+                return lane + offset * side, float(gates.heading[k]) + turn, True
+        return None if is_vehicle else (lane + left * side, float(gates.heading[k]) + turn, False)
+
+    def _is_on_lane(self, position: Float[np.ndarray, "2"]) -> bool:
+        """True where cars would not pass a parked one."""
+        return bool((np.linalg.norm(self.finder.points - position, axis=-1) < OFF_LANES_M).any())
+
+
+class OpenRollouts:
+    """Presence along N rollouts of a scenario, for `rollout.simulate`.
 
     Args:
         batch: A single scenario, with visitors (`add_visitors`).
@@ -114,32 +273,18 @@ class OpenWorld:
                 f"agents enter one scenario in the map frame, not {batch.num_scenarios} in the {batch.frame} frame: "
                 "hand over each in the map frame, or leave entries out."
             )
-        self.device = batch.device
-        (scenario,) = batch.scenarios
-        self.entries, self.finder, self.region_m = entries, GateFinder(scenario), find_region_m(scenario)
-        self.ego = int(np.flatnonzero(scenario.simulated_indices == scenario.ego_index)[0])
-        self.rngs = [
-            np.random.default_rng(derive_seed(seed, "entries", scenario.scenario_id, rollout))
-            for rollout in rollout_ids
-        ]
-        self.object_type = batch.object_type[0].cpu().numpy()
-        shape = (len(rollout_ids), len(self.object_type))
-        first_visitor = len(scenario.simulated_indices) - sum(VISITORS.values())  # padding comes behind the visitors
+        shape = (len(rollout_ids), batch.agent_mask.shape[1])
+        self.world = OpenWorld(batch.scenarios[0], shape[1], entries)
+        self.seed, self.rollout_ids, self.device = seed, rollout_ids, batch.device
+        self.presence, self._present = self.world.begin(shape[0]), []
         now = [batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]]
         self._start = torch.cat(now, -1).expand(*shape, 3).double().cpu().numpy()  # [N, A, 3]
         self._start_velocity = batch.velocity[0, :, CURRENT_STEP].expand(*shape, 2).double().cpu().numpy()
-        self.present: Bool[np.ndarray, "N A"] = np.broadcast_to(np.arange(shape[1]) < first_visitor, shape).copy()
-        self.is_parked: Bool[np.ndarray, "N A"] = np.zeros(shape, bool)
-        self.waiting = np.zeros((shape[1], 3))
-        self.waiting[:, 0] = WAITING_M + WAITING_GAP_M * (np.arange(shape[1]) - first_visitor)
-        self.waiting[:, 1] = WAITING_M
-        self._turned_away = [0] * len(rollout_ids)
-        self._valid: list[Bool[np.ndarray, "N A"]] = []
 
     @property
     def valid(self) -> Bool[Tensor, "1 N A T"]:
         """True = the agent is there at the simulated step."""
-        return torch.from_numpy(np.stack(self._valid, -1).repeat(DECISION_STEPS, -1))[None]
+        return torch.from_numpy(np.stack(self._present, -1).repeat(DECISION_STEPS, -1))[None]
 
     def force(self, state: Any, step: int) -> AgentStates:
         """States of the next half second of agents that are absent or enter.
@@ -152,81 +297,10 @@ class OpenWorld:
         if state.poses is not None:
             poses = state.poses[0].double().cpu().numpy()  # [N, A, 5, 3]
             pose, velocity = poses[:, :, -1], (poses[:, :, -1, :2] - poses[:, :, -2, :2]) / STEP_S
-        forced = np.repeat(self.waiting[None, :, None], len(pose), 0).repeat(DECISION_STEPS, 2)  # [N, A, 5, 3]
-        is_free = ~self.present  # who leaves now is away for half a second at least
-        self._remove(pose)
-        self.is_parked &= self.present
-        imposed = ~self.present | self.is_parked
-        forced[self.is_parked] = pose[self.is_parked][:, None]
-        for n in range(len(self.rngs)):
-            for agent, path, is_parked in self._enter(n, pose[n], velocity[n], is_free[n]):
-                forced[n, agent], imposed[n, agent] = path, True
-                self.present[n, agent], self.is_parked[n, agent] = True, is_parked
-        self._valid.append(self.present.copy())
-        poses, valid = torch.from_numpy(forced[None]).float(), torch.from_numpy(imposed)[None, :, :, None]
-        poses, valid = poses.to(self.device), valid.to(self.device)
-        return AgentStates(poses[..., :2], poses[..., 2], valid.expand(poses.shape[:-1]))
-
-    def _remove(self, pose: Float[np.ndarray, "N A 3"]) -> None:
-        """Agents that are beyond the border, or at the end of a lane that goes on nowhere, are absent from now on."""
-        away = np.linalg.norm(pose[..., :2] - pose[:, self.ego, None, :2], axis=-1) > self.region_m + BEYOND_BORDER_M
-        if len(self.finder.ends):
-            to_end = np.linalg.norm(pose[:, :, None, :2] - self.finder.ends, axis=-1).min(-1)
-            away |= (to_end < AT_END_M) & (self.object_type == ObjectType.VEHICLE)
-        away[:, self.ego] = False
-        self.present &= ~away
-
-    def _enter(
-        self, n: int, pose: Float[np.ndarray, "A 3"], velocity: Float[np.ndarray, "A 2"], is_free: Bool[np.ndarray, "A"]
-    ) -> list[tuple[int, Float[np.ndarray, "5 3"], bool]]:  # fmt: skip
-        """Row and poses of each agent that enters a rollout, and True for vehicles parked beside the lane."""
-        rng, present = self.rngs[n], self.present[n]
-        gates = self.finder.find(pose[self.ego, :2], velocity[self.ego], self.region_m)
-        rate = self.entries.expect(gates)
-        rate = rate * (1 + self._turned_away[n] / max(rate.sum(), 1e-6))
-        gates = gates.select(np.flatnonzero(rng.random(len(gates)) < 1 - np.exp(-rate)))
-        entrants = self.entries.draw(gates, rng)
-        free = {int(name): np.flatnonzero(is_free & (self.object_type == name)).tolist() for name in VISITORS}
-        others, others_velocity = pose[present, :2], velocity[present]
-        entered = []
-        for k in range(len(gates)):
-            chosen = self._choose_pose(gates, entrants, k)
-            if chosen is None:
-                continue
-            position, heading, is_parked = chosen
-            along, wanted_mps = np.array([np.cos(heading), np.sin(heading)]), float(entrants.speed_mps[k])
-            route = position + STRAIGHT_M[:, None] * along, STRAIGHT_M
-            if entrants.object_type[k] == ObjectType.VEHICLE and not is_parked:
-                route = self.finder.follow(int(gates.point[k]), LOOK_M)
-            speed = find_safe_speed(position, along, wanted_mps, others, others_velocity, *route)
-            rows = free.get(int(entrants.object_type[k]), [])
-            if speed is None or not rows or np.linalg.norm(position - pose[self.ego, :2]) < EGO_GAP_M:
-                continue
-            times = STEP_S * np.arange(1, DECISION_STEPS + 1)[:, None]
-            path = np.concatenate([position + times * speed * along, np.full((DECISION_STEPS, 1), heading)], -1)
-            entered.append((rows.pop(), path, is_parked))
-            others, others_velocity = np.vstack([others, position]), np.vstack([others_velocity, speed * along])
-        self._turned_away[n] = min(len(gates) - len(entered), MOST_TURNED_AWAY)
-        return entered
-
-    def _choose_pose(
-        self, gates: Gates, entrants: Entrants, k: int
-    ) -> tuple[Float[np.ndarray, "2"], float, bool] | None:
-        """Position and heading of an entrant, and True for one that is parked; None where it would block a lane."""
-        lane, left, turn = gates.position[k], float(entrants.left_m[k]), float(entrants.turn_rad[k])
-        side = np.array([-np.sin(gates.heading[k]), np.cos(gates.heading[k])])
-        is_vehicle = entrants.object_type[k] == ObjectType.VEHICLE
-        if is_vehicle and (abs(left) <= PARKED_M or entrants.speed_mps[k] >= PARKED_MPS):
-            return lane, float(gates.heading[k]), False
-        # a place to park may be on a lane of this road, then it is the side of the gate's lane
-        for offset in (left, -ROADSIDE_M) if is_vehicle else ():
-            if not self._is_on_lane(lane + offset * side):
-                return lane + offset * side, float(gates.heading[k]) + turn, True
-        return None if is_vehicle else (lane + left * side, float(gates.heading[k]) + turn, False)
-
-    def _is_on_lane(self, position: Float[np.ndarray, "2"]) -> bool:
-        """True where cars would not pass a parked one."""
-        return bool((np.linalg.norm(self.finder.points - position, axis=-1) < OFF_LANES_M).any())
+        rngs = [make_rng(self.seed, self.world.scenario_id, rollout, step) for rollout in self.rollout_ids]
+        self.presence = self.world.step(self.presence, pose, velocity, rngs)
+        self._present.append(self.presence.is_present)
+        return self.presence.impose(self.device)
 
 
 def find_safe_speed(

@@ -10,6 +10,7 @@ down is optional and opens a further door:
 | `PartlyTrainedPolicy` | fine-tuned in chosen parts, with the rest frozen |
 | `PolicyWithHead` | fine-tuned in its last layers alone |
 | `SharingPolicy` | fine-tuned faster, because passes over the same scenarios share features |
+| `RelitPolicy` | simulated for longer than 8 s without encoding maps anew whenever lights change |
 | `PretrainablePolicy` | pre-trained on logged tracks, token by token |
 | `ImitatedPolicy` | pre-trained on logged tracks with a special loss |
 | `CalibratablePolicy` | calibrated: a few named features of states and tokens get weights |
@@ -376,6 +377,31 @@ def score_with_reference(
     dist = policy.score(context, rollouts)
     with torch.no_grad():
         return dist, reference.score(ref_context, ref_rollouts)
+
+
+@runtime_checkable
+class RelitPolicy(Policy, Protocol):
+    """A policy that keeps what does not depend on traffic lights where these change, from second 8 on."""
+
+    def relight(self, context: Any, scenarios: ScenarioBatch) -> Any:
+        """`encode(scenarios)` for decisions of rollouts that have begun; the context where it sees the same lights.
+
+        Args:
+            context: Context of the same scenarios with other lights, from `encode` or `relight`.
+            scenarios: Scenarios, with the step of the lights that are seen.
+        """
+        ...
+
+
+def relight(policy: Policy, context: Any, scenarios: ScenarioBatch) -> Any:
+    """Context of scenarios with other traffic lights, encoded anew where the policy is no `RelitPolicy`.
+
+    Args:
+        policy: Policy that encoded the context.
+        context: Context of the same scenarios with other lights.
+        scenarios: Scenarios, with the step of the lights that are seen.
+    """
+    return policy.relight(context, scenarios) if isinstance(policy, RelitPolicy) else policy.encode(scenarios)
 
 
 # ---- optional: tokens

@@ -14,8 +14,8 @@ from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
-from rlftsim.rollout.open_world import OpenWorld
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
+from rlftsim.rollout.open_world import OpenRollouts
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device, relight
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenarios
@@ -72,7 +72,7 @@ def simulate(
 
     Raises:
         ConfigError: There are no rollouts, the length of a decision does not divide the steps, or goals, which are due
-            after 8 s, in rollouts of another length; or entries that do not fit policy or batch, see `OpenWorld`.
+            after 8 s, in rollouts of another length; or entries that do not fit policy or batch, see `OpenRollouts`.
         DataError: Log-probabilities are NaN, as with weights that are NaN; the scenario is named.
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
@@ -87,7 +87,7 @@ def simulate(
         raise ConfigError(
             f"goals are due after {FUTURE_STEPS} steps, not after {num_steps}: simulate 8 seconds, or leave goals out."
         )
-    world = None if entries is None else OpenWorld(batch, rollout_ids, seed, stride, entries)
+    world = None if entries is None else OpenRollouts(batch, rollout_ids, seed, stride, entries)
     force = force if world is None else world.force
     goals = goals and goals.repeat(len(rollout_ids))
 
@@ -163,7 +163,7 @@ def encode_lights(policy: Policy, batch: ScenarioBatch, context: Any, step: int)
     log_step = CURRENT_STEP + step
     has_lights = any(len(s.lights.step) and log_step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
     is_due = step >= FUTURE_STEPS and step % RELIT_STEPS == 0
-    return policy.encode(replace(batch, light_step=log_step)) if is_due and has_lights else context
+    return relight(policy, context, replace(batch, light_step=log_step)) if is_due and has_lights else context
 
 
 def _draw_decision_noise(

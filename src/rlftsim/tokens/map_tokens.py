@@ -5,6 +5,7 @@ three points are AlpaSim's, whose maps are cut by its rules (`catk/map_adapter.p
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -81,6 +82,13 @@ class MapTokens:
     light: Int64[Tensor, "B M"]
     token_mask: Bool[Tensor, "B M"]
 
+    def select(self, mask: Bool[Tensor, "B M"]) -> "MapTokens":
+        """The tokens of a mask alone, in the same order, padded to the largest number of a scenario."""
+        index = (~mask).byte().argsort(dim=1, stable=True)[:, : int(mask.sum(1).max())]  # [B, m]
+        row = torch.arange(len(index), device=index.device)[:, None]
+        selected = MapTokens(*(values[row, index] for values in vars(self).values()))
+        return replace(selected, token_mask=mask[row, index])
+
 
 def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V n 2"]) -> MapTokens:
     """Map tokens of a batch: for each piece the nearest prototype (sum of squared distances at three points).
@@ -94,10 +102,7 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V n 2"]) -> Ma
     maps = [split_map(scenario, num_points) for scenario in batch.scenarios]
     if batch.light_step != CURRENT_STEP:
         maps = [_relight(pieces, scenario, batch.light_step) for pieces, scenario in zip(maps, batch.scenarios)]
-
-    def pad(arrays: list[np.ndarray], dtype: torch.dtype) -> Tensor:
-        return pad_sequence([torch.from_numpy(array).to(dtype) for array in arrays], batch_first=True).to(batch.device)
-
+    pad = partial(_pad, device=batch.device)
     # The origin is subtracted before the result is rounded to float32.
     origins = [compute_origin(scenario, batch.frame) for scenario in batch.scenarios]
     local_points = [(segments.points - origin).astype(np.float32) for segments, origin in zip(maps, origins)]
@@ -114,6 +119,21 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V n 2"]) -> Ma
         **{name: pad([getattr(segments, name) for segments in maps], torch.int64) for name in _LABELS},
         token_mask=pad([np.ones(len(segments.heading), bool) for segments in maps], torch.bool),
     )
+
+
+def tokenize_lights(batch: ScenarioBatch, num_points: int) -> Int64[Tensor, "B M"]:
+    """Light of each map token of a batch, as in `tokenize_map`.
+
+    Args:
+        batch: Batch of which only the scenarios and the step of their lights are read.
+        num_points: Points of a map prototype, which decide how maps are cut.
+    """
+    maps = [_relight(split_map(scenario, num_points), scenario, batch.light_step) for scenario in batch.scenarios]
+    return _pad([segments.light for segments in maps], torch.int64, batch.device)
+
+
+def _pad(arrays: list[np.ndarray], dtype: torch.dtype, device: torch.device) -> Tensor:
+    return pad_sequence([torch.from_numpy(array).to(dtype) for array in arrays], batch_first=True).to(device)
 
 
 @cached_on_scenario
@@ -171,9 +191,10 @@ def _find_lights(scenario: Scenario, step: int) -> dict[int, int]:
 
 def _relight(pieces: MapSegments, scenario: Scenario, step: int) -> MapSegments:
     """The pieces with the lights of another step, at most the last of the log."""
-    lights = _find_lights(scenario, min(step, scenario.num_steps - 1))
-    lights.pop(-1, None)  # that of no lane, as pieces of other families have it
-    return replace(pieces, light=np.array([lights.get(lane, 0) for lane in pieces.lane_id.tolist()], np.int8))
+    light = np.zeros_like(pieces.light)
+    for lane, state in _find_lights(scenario, min(step, scenario.num_steps - 1)).items():
+        light[(pieces.lane_id == lane) & (pieces.family == 0)] = state
+    return replace(pieces, light=light)
 
 
 def _polygon_sides(polygon: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:

@@ -17,6 +17,7 @@ def drive(
     model: str = "demo-base",
     split: str = "validation",
     traffic: str = "policy,replay",
+    entries: str | None = None,
     scenario: list[str] | None = None,
     limit: int | None = None,
     num_rollouts: int = 1,
@@ -41,6 +42,9 @@ def drive(
         split: Split of the data set.
         traffic: Drivers of the other agents, separated by commas: policy, replay, constant_velocity, idm, or
             sumo for data made by `rlftsim synthesize --keep-worlds`.
+        entries: Who enters traffic "policy" where lanes cross the border of a region around the ego: "none",
+            "fixed-rate", a file that `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents beyond the
+            border leave. Left out, the agents of "now" are there all the time.
         scenario: Ids of the scenarios to drive; left out, all of the split.
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.
@@ -60,7 +64,7 @@ def drive(
     config = driving.DriveConfig(
         planner=planner, data=data, split=split, model=model,
         traffic=tuple(driver.strip() for driver in traffic.split(",")),
-        num_rollouts=num_rollouts, seed=seed, seconds=seconds, limit=limit,
+        num_rollouts=num_rollouts, seed=seed, seconds=seconds, entries=entries, limit=limit,
         scenarios=tuple(scenario) if scenario else None, jobs=jobs, film=film,
     )  # fmt: skip
     results = driving.drive(config, out)

@@ -197,7 +197,7 @@ def check_all_edges(done: Pass, expected: dict[str, np.ndarray], poses, map_posi
 def check_edges_of(policy, done: Pass, batch, expected) -> None:
     tokens = policy._tokenize(batch)
     scene = policy._build_scene(batch)
-    positions = tokens.position[0].numpy(), scene.map_position[0].numpy()
+    positions = tokens.position[0].numpy(), scene.tokens.position[0].numpy()
     check_all_edges(done, expected, *positions, policy.config.agent_map_radius_m)
 
 

@@ -56,6 +56,23 @@ def predictions(policy, scenario_list):
     return logits.new_zeros(*valid.shape, logits.shape[-1]).masked_scatter(valid[..., None], logits)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("most", [None, 6])
+def test_lights_that_change_give_the_features_of_an_encoding_from_the_start(vocabulary, most):
+    policy = smart(vocabulary, max_map_neighbors=most)
+    batch = collate([scenes.straight_road(), scenes.junction_with_light()])  # red until step 50
+    green = replace(batch, light_step=80)
+    context = policy.encode(batch)
+    relit = policy.relight(context, green)
+    torch.testing.assert_close(
+        relit.scene.map_features, policy.encode(green).scene.map_features, atol=ROUNDING, rtol=0.0
+    )
+    is_changed = (relit.scene.map_features != context.scene.map_features).any(-1).view(2, -1)
+    assert not is_changed[0].any()
+    assert 0 < is_changed[1].sum() < context.scene.tokens.token_mask[1].sum()
+    assert policy.relight(relit, replace(batch, light_step=90)) is relit
+
+
 # ---- invariances ---------------------------------------------------------------------------------
 
 
@@ -78,8 +95,7 @@ def features(policy, batch, turn_rad, shift_m, order=None):
     )  # fmt: skip
     class_id = class_of_type(batch.object_type)
     scene = Scene(
-        tokens.position, tokens.heading, tokens.token_mask,
-        normalize(network.map_encoder(tokens, policy.vocabulary.map_prototypes.double())), class_id,
+        tokens, normalize(network.map_encoder(tokens, policy.vocabulary.map_prototypes.double())), class_id,
         network.decoder.embed_agents(class_id, batch.size.double()),
         network.decoder.embed_tokens(policy.vocabulary.end_corners().double()),
         **network.decoder.relations(),

@@ -8,7 +8,7 @@ B scenarios, N rollouts, A agents, L decisions, K features.
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from rlftsim.policies.calibrated.features import TiltedDistribution, features_by
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
 from rlftsim.policies.registry import load_policy
-from rlftsim.rollout.policy import TokenPolicy
+from rlftsim.rollout.policy import TokenPolicy, relight
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import STEP_S
@@ -247,6 +247,15 @@ class CalibratedPolicy(nn.Module):
     def encode(self, scenarios: ScenarioBatch) -> Context:
         """Context of the base, lanes and edges of the maps, and the current step."""
         return Context(self.base.encode(scenarios), build_scene(scenarios))
+
+    def relight(self, context: Context, scenarios: ScenarioBatch) -> Context:
+        """The context with other traffic lights, which the features do not read.
+
+        Args:
+            context: Result of `encode` for the same scenarios.
+            scenarios: Scenarios, with the step of the lights.
+        """
+        return replace(context, base=relight(self.base, context.base, scenarios))
 
     def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current step, N times.

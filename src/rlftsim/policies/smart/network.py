@@ -52,20 +52,28 @@ from rlftsim.policies.smart.neighbors import Poses, bound_neighbors, find_neighb
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import find_rows, place_rows
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, WINDOW, MapTokens, tokenize_map
+from rlftsim.tokens.map_tokens import (
+    NO_MAP_POSITION_M,
+    NUM_FAMILIES,
+    NUM_LIGHTS,
+    NUM_TYPES,
+    WINDOW,
+    MapTokens,
+    tokenize_map,
+)
 from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary, class_of_type
 
 MAX_LOOK_BACK_M = 160.0
 """Largest distance between an agent and the remembered positions (3 s at 50 m/s), for tables."""
+LIGHT_MARGIN_M = 1.0
+"""Added to the reach of a light, as products of matrices give distances that are a few centimeters off."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Inputs of the decoder beside the agents' motion."""
 
-    map_position: Float[Tensor, "B M 2"]
-    map_heading: Float[Tensor, "B M"]
-    map_mask: Bool[Tensor, "B M"]
+    tokens: MapTokens
     map_features: Float[Tensor, "BM D"]
     """Normalized features of all map tokens, scenario after scenario."""
     class_id: Int64[Tensor, "B A"]
@@ -84,7 +92,12 @@ class Scene:
     @property
     def map_poses(self) -> Poses:
         """Poses [B M] of all map tokens, scenario after scenario."""
-        return Poses(self.map_position.flatten(0, 1), self.map_heading.flatten())
+        return Poses(self.tokens.position.flatten(0, 1), self.tokens.heading.flatten())
+
+    @property
+    def map_positions(self) -> Float[Tensor, "B M 2"]:
+        """Positions of the map tokens, infinite for padding."""
+        return mask_positions(self.tokens.token_mask, self.tokens.position)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +311,7 @@ class AgentDecoder(nn.Module):
         groups = group_rows(scenario, poses) if is_shared else None
         first = slice(None) if groups is None else groups.first
         tokens = find_neighbors(
-            poses.position[first], scenario[first], mask_positions(scene.map_mask, scene.map_position), None,
+            poses.position[first], scenario[first], scene.map_positions, None,
             radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
             max_neighbors=scene.max_map_tokens,
         )  # fmt: skip
@@ -453,9 +466,7 @@ class SmartNetwork(nn.Module):
             candidates = mask_positions(tokens.token_mask, tokens.position)
             max_map_tokens = bound_neighbors(candidates, decoder.config.agent_map_radius_m)
         return Scene(
-            map_position=tokens.position,
-            map_heading=tokens.heading,
-            map_mask=tokens.token_mask,
+            tokens=tokens,
             map_features=normalize(self.map_encoder(tokens, vocabulary.map_prototypes)),
             class_id=class_id,
             agent_features=decoder.embed_agents(class_id, scenarios.size),
@@ -464,6 +475,32 @@ class SmartNetwork(nn.Module):
             **decoder.relations(),
             max_map_tokens=max_map_tokens,
         )
+
+    def relight(self, scene: Scene, light: Int64[Tensor, "B M"], vocabulary: Vocabulary) -> Scene:
+        """The scene with other traffic lights; features are computed anew as far as a light that changes reaches.
+
+        Args:
+            scene: Scene of the same maps.
+            light: Light of each map token, as in `MapTokens`.
+            vocabulary: Prototypes of map tokens.
+        """
+        is_changed = light != scene.tokens.light
+        if not is_changed.any():
+            return scene
+        # each layer carries a light as far as its radius; features within reach depend on tokens up to twice as far
+        reach_m = len(self.map_encoder.layers) * self.map_encoder.config.map_radius_m + LIGHT_MARGIN_M
+        tokens, local = replace(scene.tokens, light=light), scene.tokens.position - scene.tokens.position[:, :1]
+        distance = torch.stack(
+            [
+                torch.cdist(functional.pad(points[changed], (0, 0, 0, 1), value=NO_MAP_POSITION_M), points).amin(0)
+                for points, changed in zip(local, is_changed)
+            ]
+        )
+        is_around, is_reached = (tokens.token_mask & (distance < factor * reach_m) for factor in (2, 1))  # [B, M]
+        around, features = tokens.select(is_around), scene.map_features.clone()
+        rows = normalize(self.map_encoder(around, vocabulary.map_prototypes))[around.token_mask.flatten()]
+        features[is_reached.flatten()] = rows[is_reached[is_around]]
+        return replace(scene, tokens=tokens, map_features=features)
 
     def scene_weights(self) -> list[Tensor]:
         """Weights that scenes and views are made with: all but those of the decoder's `reader_modules`."""

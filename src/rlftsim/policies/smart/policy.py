@@ -20,13 +20,14 @@ from rlftsim.policies.smart.attention import AttentionMaps
 from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, EncodedGoals, encode_goals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
-from rlftsim.policies.smart.network import Past, Scene, View, mask_positions
+from rlftsim.policies.smart.network import Past, Scene, View
 from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere
 from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, restart_at_log
+from rlftsim.tokens.map_tokens import tokenize_lights
 from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_type
 
 
@@ -142,6 +143,17 @@ class SmartPolicy(SmartModel):
             model=self,
         )
 
+    def relight(self, context: Context, scenarios: ScenarioBatch) -> Context:
+        """The context with other traffic lights, for decisions of rollouts that have begun.
+
+        Args:
+            context: Result of `encode` for the same scenarios.
+            scenarios: Scenarios, with the step of the lights.
+        """
+        light = tokenize_lights(scenarios, self.vocabulary.map_prototypes.shape[1])
+        scene = self.network.relight(context.scene, light, self.vocabulary)
+        return context if scene is context.scene else replace(context, scene=scene)
+
     def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
         """The current step, N times, without copies of the history.
 
@@ -161,7 +173,7 @@ class SmartPolicy(SmartModel):
             heading,
             context.past.without_last_step().repeat(num_rollouts),
             pending=current,
-            goals=encode_goals(goals, mask_positions(context.scene.map_mask, context.scene.map_position)),
+            goals=encode_goals(goals, context.scene.map_positions),
         )
 
     def decide(self, context: Context, state: State) -> TokenDistribution:

@@ -72,6 +72,15 @@ class TrafficBotsPolicy(nn.Module):
         """Features of the map, and of the lights at all decisions."""
         return self.encode_scene(build_scene(scenarios, HISTORY_STEPS, self.config.max_map_tokens))
 
+    def relight(self, context: Context, scenarios: ScenarioBatch) -> Context:
+        """The context: lights of the future are those that the model expects, as they are at second 8.
+
+        Args:
+            context: Result of `encode` for the same scenarios.
+            scenarios: Scenarios, with the step of the lights.
+        """
+        return context
+
     def begin(
         self, context: Context, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A 17"]
     ) -> State:
