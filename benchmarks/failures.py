@@ -9,6 +9,7 @@ Everything that is finished lies in OUT and is not done again.
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -115,11 +116,13 @@ def compare_with_brute_force(out: Path, size: Comparison) -> None:
     )
 
 
-def measure_tuning(out: Path, data: list[str], budget: str, jobs: int, limit: int | None) -> None:
+def measure_tuning(
+    out: Path, planners: Sequence[str], data: list[str], budget: str, jobs: int, limit: int | None
+) -> None:
     """Table: failures of each planner per 1 000 km in both kinds of traffic."""
     lines = []
     for folder in data:
-        for planner in PLANNERS:
+        for planner in planners:
             for model in ("demo-base", "demo-tuned"):
                 config = StudyConfig(planner, folder, model=model, limit=limit)
                 name = f"{Path(folder).name}-{planner}-{model}"
@@ -136,13 +139,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=("brute", "tuning"))
     parser.add_argument("out", type=Path)
+    parser.add_argument("--planners", nargs="+", default=PLANNERS)
     parser.add_argument("--data", nargs="+", default=["synthetic"])
     parser.add_argument("--budget", default="90m", help="of each study of `tuning`, time of one core")
     parser.add_argument("--limit", type=int, help="scenarios of each study of `tuning`, the first ones; default: all")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--quick", action="store_true")
     sizes = parser.add_argument_group("size of `brute`")
-    sizes.add_argument("--planners", nargs="+", default=PLANNERS)
     for field in fields(Comparison)[1:]:
         sizes.add_argument(f"--{field.name}", type=int, default=field.default)
     arguments = parser.parse_args()
@@ -154,7 +157,7 @@ def main() -> None:
         compare_with_brute_force(arguments.out, Comparison(tuple(arguments.planners), **numbers))
     else:
         budget, limit = ("60s", 2) if arguments.quick else (arguments.budget, arguments.limit)
-        measure_tuning(arguments.out, arguments.data, budget, arguments.jobs, limit)
+        measure_tuning(arguments.out, arguments.planners, arguments.data, budget, arguments.jobs, limit)
 
 
 if __name__ == "__main__":

@@ -134,8 +134,7 @@ def resident_mb():
 DRIVE = """
 import sys, time
 from rlftsim.envs.drive import drive
-from rlftsim.envs.drive_scenario import DriveConfig, make_environment
-from rlftsim.envs.planners.registry import load_planner
+from rlftsim.envs.drive_scenario import DriveConfig
 planner, traffic, limit = sys.argv[1:]
 drive(DriveConfig(planner, traffic=(traffic,), limit=1))
 begin = time.process_time()

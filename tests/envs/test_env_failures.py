@@ -12,6 +12,7 @@ from rlftsim.envs.dangers import EVENTS, StepView, find_event
 from rlftsim.envs.failure_run import _drive_pilot
 from rlftsim.envs.failure_study import StudyConfig
 from rlftsim.envs.failures import Failure, FailureChain, choose_failures, make_source
+from rlftsim.envs.planners.pdm import PdmPlanner
 from rlftsim.envs.planners.registry import PlannerFailure, load_planner
 from rlftsim.envs.record import build_record
 from rlftsim.envs.result import Result
@@ -77,6 +78,18 @@ class Random(Counting):
         return self.random.uniform(-1, 1, 2).astype(np.float32) * [1.0, 0.1]
 
 
+class Noting(PdmPlanner):
+    """Counts its actions, which is no declared memory: every agent acts alone."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def act_batch(self, observe):
+        self.count += 1
+        return super().act_batch(observe)
+
+
 def chain_of(model, event, planner="idm", **settings):
     planner = load_planner(planner) if isinstance(planner, str) else planner
     source = make_source(planner, straight_road(), model, **settings)
@@ -115,6 +128,17 @@ def test_a_failure_runs_again_bit_for_bit(model, planner):
         found.run_again(replace(branched[0], digest="0"))
     with pytest.raises(DataError, match=r"a failure at step 999 .*: estimate again"):
         found.run_again(replace(branched[0], step=999))
+
+
+def test_planners_that_act_together_drive_as_each_would_alone(model):
+    numbers, blocks = np.arange(3), np.array([1, 3, 2])
+    driven = []
+    for planner in (PdmPlanner(), Noting()):
+        chain = chain_of(model, "collision", planner, max_steps=STEPS)
+        parents, _ = chain.start(numbers)
+        driven.append([*parents, *chain.branch(parents, blocks, numbers + 3)[0]])
+    assert all(np.array_equal(a.motion, b.motion) for a, b in zip(*driven))
+    assert {path.planners[-1].count for path in driven[1]} == {STEPS - 5}
 
 
 def test_an_undisturbed_episode_is_that_of_the_environment(model):

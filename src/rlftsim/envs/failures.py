@@ -9,7 +9,7 @@ the same dice and the planner's stored motion, which gives equal bits; the plann
 import copy
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
@@ -23,6 +23,7 @@ from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, CollisionType
 from rlftsim.envs.dangers import Event, StepView, find_event
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
+from rlftsim.envs.planners.batch import act_together, acts_together
 from rlftsim.envs.planners.registry import Planner, PlannerFailure, guard_planner, read_action_settings, to_planner
 from rlftsim.envs.record import build_record
 from rlftsim.envs.resets import describe_start
@@ -198,7 +199,7 @@ class FailureChain:
         for block in range(self.num_blocks):
             begin = block * self.block_steps
             steps = slice(begin, begin + self.block_steps)
-            acts = np.flatnonzero(shared <= block)
+            acts = np.flatnonzero(shared[:count] <= block)
             # 1. dice, and planners that take over or have new dice
             if block and (dice[:, block] != dice[:, block - 1]).any():
                 state = replace(state, world=with_dice(episode.world, state.world, self._dice(dice[:, block])))
@@ -220,16 +221,14 @@ class FailureChain:
             # 2. the steps
             action = np.zeros((size, *self.source.controls.limits.shape))
             for step in range(0, self.block_steps, episode.controls.steps):
-                if len(acts):
-                    seen = look(episode, state)
-                    with guard_planner(self.planner, self.scenario_id, lambda now=begin + step: now):
-                        for row in acts[acts < count]:
-                            action[row] = planners[row].act(seen.of_agent(int(row)))
+                with guard_planner(self.planner, self.scenario_id, lambda now=begin + step: now):
+                    for row, acted in zip(acts, _act(planners, acts, episode, state)):
+                        action[row] = acted
                 forced = imposed[:, step : step + episode.controls.steps]
                 state, _ = advance(episode, state, action, forced)
                 if observe is not None:
                     observe(episode, state)
-                for row in acts[acts < count]:
+                for row in acts:
                     now = slice(begin + step + 1, begin + step + 1 + episode.controls.steps)
                     danger[row, now] = self.event.danger(StepView(episode, state, int(row)))
         motion = np.stack([track[tuple(episode.world.actors.T)] for track in state.world.track[CURRENT_STEP + 1 :]], 1)
@@ -324,6 +323,19 @@ class FailureChain:
 def _build_episode(source: Source, scenario_id: str, size: int) -> Episode:
     """Scenes of a scenario side by side."""
     return source.episode([source.scenario(scenario_id)] * size)
+
+
+def _act(
+    planners: Sequence[Planner], rows: Int64[np.ndarray, "m"], episode: Episode, state: EpisodeState
+) -> Iterable[Any]:
+    """Actions in some rows, at once where the planners can."""
+    if not len(rows):
+        return ()
+    acting = [planners[row] for row in rows]
+    if acts_together(acting[0]):
+        return act_together(acting, lambda: {name: a[rows] for name, a in look(episode, state).by_name().items()})
+    seen = look(episode, state)
+    return [planner.act(seen.of_agent(int(row))) for planner, row in zip(acting, rows)]
 
 
 def copy_planner(planner: Planner) -> Planner:

@@ -57,6 +57,7 @@ class PdmPlanner(BatchPlanner):
     """The best of 15 proposals: 5 fractions of the wanted speed times 3 offsets from the route."""
 
     action: ActionType = "bicycle"
+    memory = ("_plan",)
 
     def __init__(self) -> None:
         self._plan = np.zeros((0, 0, 2), np.float32)
