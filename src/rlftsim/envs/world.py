@@ -32,6 +32,7 @@ from rlftsim.envs.sumo_traffic import SumoScene, SumoState, advance_sumo, begin_
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.threads import one_thread
+from rlftsim.rollout.decisions import check_log_prob, check_numbers, read_poses
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.open_world import OpenWorld, Presence, make_rng
@@ -477,7 +478,10 @@ def _decide(world: World, state: WorldState) -> Block:
         if presences:
             states = [presence.impose(world.batch.device) for presence in presences]
             imposed = AgentStates(*(torch.cat(values) for values in zip(*(vars(state).values() for state in states))))
-        poses = policy.advance(context, policy_state, decision, imposed).poses
+        shape, log_prob = (len(world.mask), 1, world.mask.shape[1]), distribution.log_prob(decision, world.sampling)
+        check_log_prob(policy, log_prob, shape)
+        poses = read_poses(policy, policy.advance(context, policy_state, decision, imposed), shape)
+        check_numbers(policy, world.batch, log_prob, poses[..., :2], poses[..., 2])
     return Block(policy_state, context, decision, poses[:, 0].cpu().numpy().astype(np.float64), presences)
 
 

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
+from rlftsim.errors import DataError
 from rlftsim.rollout.baselines import check_no_top_k
 from rlftsim.rollout.policy import DecisionStatistics, Sampling
 from rlftsim.rollout.rows import pick_rows, place_rows
@@ -253,11 +254,24 @@ class CategoricalDistribution:
 
 @dataclass(frozen=True, eq=False)
 class TokenDistribution(CategoricalDistribution):
-    """Distributions with logits that have been computed already."""
+    """Distributions with logits that have been computed already.
+
+    Raises:
+        DataError: The logits have no row for each element that the mask names.
+    """
 
     logits: Float[Tensor, "R V"]
     mask: Bool[Tensor, "*batch"]
     sampling: Sampling = FULL
+
+    def __post_init__(self) -> None:
+        # counted only where rows are left out, so that the host waits for no device
+        is_dense = len(self.logits) == self.mask.numel()
+        if self.logits.dim() != 2 or not (is_dense or len(self.logits) == int(self.mask.sum())):
+            raise DataError(
+                f"logits are {list(self.logits.shape)}, and the mask {list(self.mask.shape)} is True for "
+                f"{int(self.mask.sum())} agents: logits are [R, V], a row for each of these, in the order of the mask."
+            )
 
 
 @dataclass(frozen=True, eq=False)

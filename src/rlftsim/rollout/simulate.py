@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
+from rlftsim.rollout.decisions import check_log_prob, check_numbers, read_poses
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.open_world import OpenRollouts
@@ -73,7 +74,8 @@ def simulate(
     Raises:
         ConfigError: There are no rollouts, the length of a decision does not divide the steps, or goals, which are due
             after 8 s, in rollouts of another length; or entries that do not fit policy or batch, see `OpenRollouts`.
-        DataError: Log-probabilities are NaN, as with weights that are NaN; the scenario is named.
+        DataError: The policy returns distributions or poses of a wrong shape, or NaN, as with weights that are NaN, or
+            poses farther away than any road; the scenario is named.
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
     stride = policy.steps_per_decision
@@ -98,7 +100,7 @@ def simulate(
     # 2. the loop
     context = policy.encode(batch) if context is None else context
     state = policy.begin(context, len(rollout_ids), goals, initial)
-    draws = state.draws
+    draws, shape = state.draws, (batch.num_scenarios, len(rollout_ids), batch.agent_mask.shape[1])
     poses, decisions, log_probs, forced_states, masks = [], [], [], [], []
     for step, decision_noise in zip(range(0, num_steps, stride), noise):
         context = encode_lights(policy, batch, context, step)
@@ -107,9 +109,10 @@ def simulate(
         decision = choose(distribution, state, *arguments) if choose else distribution.sample(*arguments)
         forced = force(state, step) if force else None
         state = policy.advance(context, state, decision, forced)
-        poses.append(state.poses)
+        poses.append(read_poses(policy, state, shape))
         decisions.append(decision)
         log_probs.append(distribution.log_prob(decision, sampling))
+        check_log_prob(policy, log_probs[-1], shape)
         masks.append(getattr(distribution, "mask", None))
         forced_states.append(forced)
         if observe is not None:
@@ -119,13 +122,8 @@ def simulate(
     valid = None if world is None else world.valid.to(batch.device)
     rollouts = _join_decisions(batch, poses, decisions, log_probs, forced_states, masks)
     rollouts = replace(rollouts, draws=draws, goals=goals, valid=valid)
-    is_nan = rollouts.log_prob.isnan().flatten(1).any(1)  # [B]
-    if not may_be_nan and is_nan.any():
-        first = batch.scenarios[int(is_nan.nonzero()[0])].scenario_id
-        raise DataError(
-            f"{type(policy).__name__} decides with probabilities that are NaN in scenario {first}: load its weights "
-            "again if they diverged, or leave out a scenario with extreme values."
-        )
+    if not may_be_nan:
+        check_numbers(policy, batch, rollouts.log_prob, rollouts.position, rollouts.heading)
     return rollouts
 
 

@@ -1,0 +1,97 @@
+"""What a policy returns for a decision, checked: a wrong shape or a NaN is told where it arises, by the policy's name.
+
+B scenarios, N rollouts, A agents, t steps of 0.1 s per decision.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rlftsim.errors import DataError
+from rlftsim.rollout.policy import Policy
+from rlftsim.scenario.batch import ScenarioBatch
+
+MAX_COORDINATE_M = 1e6
+"""Farther from the origin of the map frame no agent is."""
+
+
+def read_poses(policy: Policy, state: Any, shape: tuple[int, int, int]) -> Float[Tensor, "B N A t 3"]:
+    """The poses of a state after a decision.
+
+    Args:
+        policy: Policy that the state is of.
+        state: Result of `policy.advance`.
+        shape: Numbers of scenarios, rollouts and agents.
+
+    Raises:
+        DataError: No poses, or of another shape or type.
+    """
+    poses, expected = getattr(state, "poses", None), (*shape, policy.steps_per_decision, 3)
+    if not isinstance(poses, Tensor):
+        given = f"a {type(state).__name__} without" if poses is None else f"a {type(poses).__name__} as"
+    elif poses.shape != expected or poses.dtype != torch.float32:
+        given = f"{str(poses.dtype).removeprefix('torch.')} {list(poses.shape)} as"
+    else:
+        return poses
+    raise DataError(
+        f"{type(policy).__name__}.advance gives {given} poses: return a state with `poses`, x, y and heading of the "
+        f"{expected[3]} steps of a decision (steps_per_decision), float32 [B, N, A, t, 3] = {list(expected)}."
+    )
+
+
+def check_log_prob(policy: Policy, log_prob: Any, shape: tuple[int, int, int]) -> None:
+    """Check the shape of the log-probabilities of drawn decisions.
+
+    Args:
+        policy: Policy that decided.
+        log_prob: Result of `log_prob` of the distribution that `policy.decide` returned.
+        shape: Numbers of scenarios, rollouts and agents.
+
+    Raises:
+        DataError: Another shape.
+    """
+    if not isinstance(log_prob, Tensor) or log_prob.shape != shape:
+        given = list(log_prob.shape) if isinstance(log_prob, Tensor) else f"a {type(log_prob).__name__}"
+        raise DataError(
+            f"{type(policy).__name__}.decide gives a distribution whose log_prob is {given}: a number for each agent "
+            f"is needed, [B, N, A] = {list(shape)}, padding included."
+        )
+
+
+def check_numbers(
+    policy: Policy,
+    batch: ScenarioBatch,
+    log_prob: Float[Tensor, "B N A *L"],
+    position: Float[Tensor, "B N A t 2"],
+    heading: Float[Tensor, "B N A t"],
+) -> None:
+    """Check that decisions have probabilities and lead somewhere: NaN would score like an agent that is not there.
+
+    Args:
+        policy: Policy that decided.
+        batch: Scenarios of the decisions.
+        log_prob: Log-probabilities of the decisions.
+        position: Positions that the decisions led to, map frame, meters.
+        heading: Headings at these positions, rad.
+
+    Raises:
+        DataError: A NaN, or a position more than `MAX_COORDINATE_M` from the origin; scenario and agent are named.
+    """
+    name, is_nan = type(policy).__name__, log_prob.isnan().flatten(1).any(1)  # [B]
+    if is_nan.any():
+        first = batch.scenarios[int(is_nan.nonzero()[0])].scenario_id
+        raise DataError(
+            f"{name} decides with probabilities that are NaN in scenario {first}: load its weights again if they "
+            "diverged, or leave out a scenario with extreme values."
+        )
+    is_lost = ~((position.abs() <= MAX_COORDINATE_M).all(-1) & heading.isfinite())  # [B, N, A, t]
+    if is_lost.any():
+        row, rollout, agent, step = is_lost.nonzero()[0].tolist()
+        x, y = position[row, rollout, agent, step].tolist()
+        raise DataError(
+            f"{name} moves agent {int(batch.object_id[row, agent])} of scenario {batch.scenarios[row].scenario_id} to "
+            f"x {x:.4g} m, y {y:.4g} m, heading {float(heading[row, rollout, agent, step]):.4g} rad: positions must be "
+            f"within {MAX_COORDINATE_M:g} m of the map's origin, and all values numbers."
+        )
