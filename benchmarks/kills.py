@@ -25,6 +25,7 @@ import sys
 import time
 from collections import Counter
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from multiprocessing import forkserver
 from pathlib import Path
 
@@ -323,6 +324,7 @@ def measure(options):
     write_sources(sources, options.scenarios)
     start_fork_server()
     rounds = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
+    inline = cache(lambda name: undisturbed(commands(sources, out)[name], "inline", out, log))
     for backend in options.backends:
         chosen = {
             name: words for name, words in commands(sources, out).items() if name in (options.commands or COMMANDS)
@@ -333,8 +335,9 @@ def measure(options):
             had, number = sum(sum(one["kills"].values()) for one in own), len(own)
             if had >= wanted:
                 continue
-            expected, _ = undisturbed(words, "inline", out, log)
-            _, seconds = undisturbed(words, backend, out, log)
+            expected, seconds = inline(name)
+            if backend != "inline":
+                _, seconds = undisturbed(words, backend, out, log)
             while had < wanted:
                 dice = random.Random(f"{options.seed} {backend} {name} {number}")
                 kills = disturbed(words, backend, out, log, seconds, dice)

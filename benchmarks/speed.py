@@ -115,7 +115,7 @@ def job_command(options: Options, side: Side, job: Job) -> list[str]:
     """Command line of a job's process."""
     job = replace(job, inputs=str(options.inputs), shared=job.shared or str(options.shared.resolve()))
     if options.dry_run and job.device == "cuda":
-        job = replace(job, device="cpu", scenarios=job.scenarios[:1], num_rollouts=2, batch_size=1)
+        job = replace(job, device="cpu", scenarios=job.scenarios[:1], num_rollouts=2, batch_size=1, warms_up=False)
     if side != "public":
         return [sys.executable, str(HERE / "speed_jobs.py"), job.write()]
     job = replace(job, checkout=str(options.catk), timed_rollouts=options.public_rollouts)

@@ -55,6 +55,8 @@ class Job:
     """Scenarios of a fine-tuning update."""
     model: str = "demo"
     """That a fine-tuning update starts from: "demo", or "tiny"."""
+    warms_up: bool = True
+    """Runs once before it is timed."""
     shared: str = ""
     """Folder of the official material; of `prepare_evaluated`: the folder with its records."""
     checkout: str = ""
@@ -130,7 +132,7 @@ def stands(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def start(job: Job) -> Repeat:
-    """Load everything a job needs and run it once, so that what happens only once is not timed."""
+    """Load everything a job needs, and run it once where it warms up: what happens only once is not timed."""
     import torch
 
     from rlftsim.cli.main import keep_freed_memory
@@ -145,7 +147,8 @@ def start(job: Job) -> Repeat:
         with torch.autocast(job.device, torch.bfloat16, enabled=is_coarse):
             return work()
 
-    repeat()
+    if job.warms_up:
+        repeat()
     return repeat
 
 

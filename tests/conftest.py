@@ -1,3 +1,4 @@
+import multiprocessing
 import os
 import shutil
 import sys
@@ -25,6 +26,11 @@ os.environ.pop("COLUMNS", None)
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
 settings.load_profile("rlftsim")
 
+multiprocessing.set_forkserver_preload(["rlftsim.verbs.evaluate", "rlftsim.verbs.convert", "rlftsim.verbs.drive"])
+
+# no test cuts the power: nothing waits for the disk
+os.fsync = lambda file: None
+
 # Archives are unpacked alike by all versions: Python 3.11.0 to 3.11.3 have no filters, 3.12 warns where none is set.
 if hasattr(tarfile, "data_filter"):
     tarfile.TarFile.extraction_filter = staticmethod(tarfile.data_filter)
@@ -45,10 +51,23 @@ def shared() -> Path:
     return folder
 
 
+def pytest_runtest_setup():
+    type_checks.CALLS.clear()
+
+
 @pytest.fixture(autouse=True)
 def forget_the_width(monkeypatch):
     """Tables are as wide as in a file unless a test says another width."""
     monkeypatch.delenv("COLUMNS", raising=False)
+
+
+@pytest.fixture(autouse=True)
+def fork_workers(request, monkeypatch):
+    """Workers are forked from a server that has imported what they would import; two folders spawn them as users do."""
+    if not {"jobs", "submission"} & {*request.path.parts}:
+        choose = multiprocessing.get_context
+        methods = {"spawn": "forkserver"}
+        monkeypatch.setattr(multiprocessing, "get_context", lambda method=None: choose(methods.get(method, method)))
 
 
 @pytest.fixture(autouse=True)

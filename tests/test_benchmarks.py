@@ -10,10 +10,16 @@ import torch
 BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "speed.py"
 
 
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """Folder of the inputs, which are made once."""
+    return tmp_path_factory.mktemp("speed")
+
+
 @pytest.mark.official
-def test_the_speed_table_has_a_line_for_each_row_and_continues_where_it_was_stopped(shared, tmp_path):
+def test_the_speed_table_has_a_line_for_each_row_and_continues_where_it_was_stopped(shared, work, tmp_path):
     words = ["--shared", shared, "--rows", "metric", "gpu", "--repeats", "1", "--out", tmp_path / "table.md"]
-    command = [str(word) for word in (sys.executable, BENCHMARK, tmp_path, *words)]
+    command = [str(word) for word in (sys.executable, BENCHMARK, work, *words)]
 
     first = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     again = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -28,9 +34,9 @@ def test_the_speed_table_has_a_line_for_each_row_and_continues_where_it_was_stop
 
 @pytest.mark.slow
 @pytest.mark.official
-def test_a_dry_run_does_every_work_of_the_gpu_in_half_precision_on_the_cpu(shared, tmp_path):
+def test_a_dry_run_does_every_work_of_the_gpu_in_half_precision_on_the_cpu(shared, work):
     words = ["--shared", shared, "--rows", "gpu", "--repeats", "1", "--dry-run"]
-    command = [str(word) for word in (sys.executable, BENCHMARK, tmp_path, *words)]
+    command = [str(word) for word in (sys.executable, BENCHMARK, work, *words)]
 
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
 

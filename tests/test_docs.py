@@ -47,8 +47,8 @@ TAKEN_FOR_GRANTED = {
 """Files and folders that a page's reader has."""
 WITH_TEMPLATE = (ROOT / "docs" / "plugin_template" / "README.md", ROOT / "docs" / "tutorials" / "5_reward.md")
 """Pages whose reader has installed the plug-in template."""
-SMALL_PYTHON = ("README.md",)
-"""Pages whose Python runs among the small things, too: it would take ten minutes."""
+SMALL_PYTHON = ("README.md", "training.md")
+"""Pages whose Python runs among the small things, too: it would take minutes."""
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?")
 TOLERANCE = 1e-4
 LOOSE = {"3_finetune.md": 0.5, "4_goals.md": 0.5}

@@ -142,3 +142,12 @@ def test_what_was_right_is_not_checked_again(checked):
     assert type(checked.Anything).count == count
     checked.look("another class")
     assert type(checked.Anything).count > count
+
+
+@pytest.mark.parametrize("test", ["first", "second"])
+def test_a_loop_is_checked_at_its_beginning_in_every_test(checked, test):
+    with pytest.raises(jaxtyping.TypeCheckError):
+        checked.Box.double("1")
+    for number in range(type_checks.MOST_CALLS):
+        checked.Box.double(number)
+    assert checked.Box.double("1") == "11"

@@ -2,7 +2,9 @@
 
 jaxtyping checks the arguments of each call twice and its result once, which took half of the time of the tests. The
 verdict on a value depends on its class and its text, or on the class, dtype and shape of an array: calls of a function
-with values alike are checked once in a process. Calls with lists, dictionaries and sets are checked each time.
+with values alike are checked once in a process. Calls with lists, dictionaries and sets are checked each time. A
+function that a test calls more than `MOST_CALLS` times is in a loop, where one call is like the others: the rest of its
+calls in this test are not checked.
 """
 
 import functools
@@ -20,7 +22,11 @@ CONTAINERS = (tuple, list, dict, set, frozenset)
 CHECKED: dict[tuple, dict[tuple, set]] = defaultdict(dict)
 """Right results by right arguments by function: its name and its code, as inner functions are made again and again."""
 IN_HAND = threading.local()
-check_each_call = jaxtyping.jaxtyped
+MOST_CALLS = 100
+"""Calls of a function that are checked in a test."""
+CALLS: dict[int, int] = {}
+"""Calls of each function in the test that runs; a test begins with none."""
+check_each_call, config = jaxtyping.jaxtyped, jaxtyping.config
 
 
 class LooksInside(Exception):
@@ -47,7 +53,8 @@ def check_once(fn: Any = None, **options: Any) -> Any:
         return functools.partial(check_once, **options)
     if not isinstance(fn, FunctionType):
         return check_each_call(fn, **options)
-    results, in_hand = CHECKED[fn.__module__, fn.__qualname__, fn.__code__], IN_HAND
+    name = fn.__module__, fn.__qualname__, fn.__code__
+    results, in_hand, counter = CHECKED[name], IN_HAND, id(CHECKED[name])
 
     def hand_out(*args, **kwargs):
         return in_hand.result
@@ -64,7 +71,8 @@ def check_once(fn: Any = None, **options: Any) -> Any:
 
     @functools.wraps(fn)
     def call(*args, **kwargs):
-        if jaxtyping.config.jaxtyping_disable:
+        CALLS[counter] = number = CALLS.get(counter, 0) + 1
+        if number > MOST_CALLS or config.jaxtyping_disable:
             return fn(*args, **kwargs)
         try:
             arguments = (*map(describe, args), *kwargs, *map(describe, kwargs.values()))

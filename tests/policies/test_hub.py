@@ -1,8 +1,9 @@
 """Models go to Hugging Face and come back with the same bits; a stand-in on this machine answers."""
 
+import contextlib
+import multiprocessing
 import os
 import re
-import subprocess
 import sys
 
 import pytest
@@ -43,21 +44,35 @@ def model(tmp_path, vocabulary):
     return tmp_path / "model"
 
 
+def run_command(words, environment, printed):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "huggingface_hub"]:
+        del sys.modules[name]
+    os.environ.update(environment)
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        status = main([*map(str, words)])
+    printed.flush()
+    sys.exit(status)
+
+
 @pytest.fixture
 def run(hub, tmp_path):
-    """A command in a process of its own, as the library reads its settings when it is imported."""
+    """A command in a forked process, where the library is imported anew: it reads its settings at that moment."""
     pytest.importorskip("huggingface_hub", reason="huggingface_hub is not installed")
 
     def call(*words, token=hub_server.TOKEN, status=0):
         environment = {
-            **os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"), "HF_TOKEN": token,
+            "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"), "HF_TOKEN": token,
             "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1", "HF_HUB_DISABLE_PROGRESS_BARS": "1",
         }  # fmt: skip
-        command = [sys.executable, "-m", "rlftsim", *map(str, words)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-        assert done.returncode == status, done.stdout + done.stderr
-        assert "Traceback" not in done.stderr
-        return done.stdout + done.stderr
+        with open(tmp_path / "printed.txt", "w+") as printed:
+            child = multiprocessing.get_context("fork").Process(target=run_command, args=(words, environment, printed))
+            child.start()
+            child.join(300)
+            printed.seek(0)
+            text = printed.read()
+        assert child.exitcode == status, text
+        assert "Traceback" not in text
+        return text
 
     return call
 

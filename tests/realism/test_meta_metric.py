@@ -179,7 +179,7 @@ def test_features_serve_several_metrics(scenario):
 
 
 def test_memory_bounds_change_no_value(scenario):
-    states = draw_rollouts(scenario, 4, seed=1)
+    states = draw_rollouts(scenario, 2, seed=1)
     small = score(scenario, states, compute=ComputeConfig(max_pairs=1))
     large = score(scenario, states, compute=ComputeConfig(max_pairs=1 << 22))
     assert small.to_official_fields() == large.to_official_fields()

@@ -381,9 +381,20 @@ def processes_of_group(group):
     return found
 
 
+def go_on(out):
+    tiny.run("pretrain", out, updates=UPDATES, processes=2, batch_size=2)
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Folder of a run that nothing stops."""
+    return go_on(tmp_path_factory.mktemp("whole"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_run_leaves_no_process_behind_and_is_resumed_bit_for_bit(kind, tmp_path):
+def test_a_stopped_run_leaves_no_process_behind_and_is_resumed_bit_for_bit(kind, whole, tmp_path):
     out = tmp_path / "stopped"
     process = start(out)
     wait_for(lambda: len(read_metrics(out)) > 2 or process.poll() is not None, "no updates were made")
@@ -399,7 +410,5 @@ def test_a_stopped_run_leaves_no_process_behind_and_is_resumed_bit_for_bit(kind,
         kept = len(read_metrics(out))
         assert error.rstrip().endswith(f"KeyboardInterrupt: continues behind update {kept}")
     assert 2 < len(read_metrics(out)) < UPDATES
-    for folder in (out, tmp_path / "whole"):
-        tiny.run("pretrain", folder, updates=UPDATES, processes=2, batch_size=2)
-    assert same_weights(out, tmp_path / "whole")
-    assert timeless(out) == timeless(tmp_path / "whole")
+    assert same_weights(go_on(out), whole)
+    assert timeless(out) == timeless(whole)

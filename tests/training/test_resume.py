@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,19 @@ def train(stage, vocabulary, scenarios, out, **changes):
     return tiny.train(stage, tiny.tiny_policy(vocabulary), scenarios, out, **changes)
 
 
+@pytest.fixture(scope="module")
+def whole(vocabulary, drawn_scenarios, tmp_path_factory):
+    """Folder of a run that nothing stops, made once for the same settings."""
+
+    @cache
+    def make(stage, **changes):
+        out = tmp_path_factory.mktemp("whole")
+        train(stage, vocabulary, drawn_scenarios, out, **changes)
+        return out
+
+    return make
+
+
 def stop_at(monkeypatch, stage, update, *, presses=None, number=signal.SIGINT):
     """Let a run be interrupted in the middle of its n-th update: by an exception, or by Ctrl-C so many times."""
     module = MODULES[stage]
@@ -72,22 +86,21 @@ def stop_at(monkeypatch, stage, update, *, presses=None, number=signal.SIGINT):
     [("pretrain", 1), ("pretrain", 4), ("catk", 1), ("catk", 4), ("road", 7), ("finetune", 1), ("everything", 4)],
 )
 def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
-    stage, update, vocabulary, drawn_scenarios, tmp_path, monkeypatch
+    stage, update, whole, vocabulary, drawn_scenarios, tmp_path, monkeypatch
 ):
     # Five or seven updates, checkpoints after every second and in the end.
-    changes = {"epochs": 1.75 if update > 5 else 1.25, "batch_size": 1}
-    train(stage, vocabulary, drawn_scenarios, tmp_path / "whole", **changes)
+    changes = {"epochs": 1.75 if stage == "road" else 1.25, "batch_size": 1}
     with monkeypatch.context() as patch:
         stop_at(patch, stage, update)
         with pytest.raises(KeyboardInterrupt):
             train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
     assert not (tmp_path / "stopped" / "model").exists()
     train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
-    assert_same_weights(tmp_path / "whole", tmp_path / "stopped")
+    assert_same_weights(whole(stage, **changes), tmp_path / "stopped")
     lines = read_metrics(tmp_path / "stopped")
     assert [line["update"] for line in lines] == list(range(1, len(lines) + 1))
     timeless = {k for k in lines[0] if k != "time" and not k.startswith("seconds")}
-    for mine, other in zip(lines, read_metrics(tmp_path / "whole")):
+    for mine, other in zip(lines, read_metrics(whole(stage, **changes))):
         assert {k: mine[k] for k in timeless} == {k: other[k] for k in timeless}
 
 
@@ -107,13 +120,10 @@ def test_a_signal_of_slurm_or_of_a_closed_terminal_keeps_the_update_that_has_beg
     [("pretrain", 1, 1), ("pretrain", 3, 2), ("road", 5, 1), ("everything", 3, 1)],
 )
 def test_ctrl_c_keeps_the_update_that_has_begun(
-    stage, update, processes, vocabulary, drawn_scenarios, tmp_path, monkeypatch, capsys
+    stage, update, processes, whole, vocabulary, drawn_scenarios, tmp_path, monkeypatch, capsys
 ):
-    changes = {
-        "epochs": (1.75 if stage == "road" else 1.25) * processes, "batch_size": processes,
-        "device": replace(tiny.CPU, processes=processes),
-    }  # fmt: skip
-    train(stage, vocabulary, drawn_scenarios, tmp_path / "whole", **changes)
+    changes = {"epochs": (1.75 if stage == "road" else 1.25) * processes, "batch_size": processes}
+    changes |= {"device": replace(tiny.CPU, processes=processes)} if processes > 1 else {}
     with monkeypatch.context() as patch:
         stop_at(patch, stage, update, presses=1)
         with pytest.raises(KeyboardInterrupt, match=f"continues behind update {update}"):
@@ -123,8 +133,8 @@ def test_ctrl_c_keeps_the_update_that_has_begun(
     assert len(read_metrics(tmp_path / "stopped")) == update
     train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
     assert f"goes on behind update {update}:" in capsys.readouterr().err
-    assert_same_weights(tmp_path / "whole", tmp_path / "stopped")
-    assert len(read_metrics(tmp_path / "stopped")) == len(read_metrics(tmp_path / "whole"))
+    assert_same_weights(whole(stage, **changes), tmp_path / "stopped")
+    assert len(read_metrics(tmp_path / "stopped")) == len(read_metrics(whole(stage, **changes)))
 
 
 @pytest.mark.parametrize(

@@ -238,7 +238,7 @@ def validate(
     Raises:
         DataError: A scenario withholds the future.
     """
-    from rlftsim.statistics import interval_around  # scipy.stats: half a second that configurations need not pay
+    from rlftsim.statistics import interval_around  # scipy: time that configurations need not pay
 
     start = time.perf_counter()
     # A copy, so that neither the mode nor a cache of the model in training changes.
