@@ -7,48 +7,16 @@ Entries are fitted on the training split; the worlds that are simulated are of t
 """
 
 import argparse
+import tempfile
 import time
-from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
-from long_world_samples import (  # beside this file
-    WindowSamples,
-    compute_distance,
-    join_samples,
-    measure_windows,
-    read_log,
-    read_rollouts,
-)
 
 import rlftsim as rs
+from rlftsim.evaluation.windows import HEADINGS, evaluate_windows
 from rlftsim.policies.registry import load_policy
-from rlftsim.rollout.entries import ENTRIES, fit_entries
-from rlftsim.rollout.open_world import add_visitors
-from rlftsim.rollout.simulate import simulate
-from rlftsim.scenario.batch import collate
-
-HEADINGS = (
-    "world", "seconds", "agents within 60 m", "that move", "speed of these [m/s]", "W1 of speed [m/s]", "W1 of gap [m]",
-    "ego [m/s]", "collisions per agent-min", "entries per min",
-)  # fmt: skip
-
-
-def table_row(name: str, window: int, samples: WindowSamples, log: WindowSamples) -> list[str]:
-    """Cells of a window; ratios to the log in parentheses."""
-
-    def ratio(field: str) -> str:
-        value, truth = (
-            float(np.mean(getattr(of, field))) if len(getattr(of, field)) else np.nan for of in (samples, log)
-        )
-        return f"{value:.1f}" if samples is log else f"{value:.1f} ({value / max(truth, 0.01):.2f})"
-
-    minutes = samples.agent_minutes.sum()
-    return [
-        name, f"{10 * window}-{10 * window + 10}", ratio("density"), ratio("driving"), ratio("speed"),
-        f"{compute_distance(samples.speed, log.speed):.2f}", f"{compute_distance(samples.gap, log.gap):.1f}",
-        ratio("ego_speed"), f"{samples.collisions.sum() / minutes:.2f}", f"{6 * samples.entries.mean():.0f}",
-    ]  # fmt: skip
+from rlftsim.rollout.entries import fit_entries, write_entries
 
 
 def main() -> None:
@@ -58,33 +26,26 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="data set of long logs, with both splits")
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--num-rollouts", type=int, default=2)
-    parser.add_argument("--seconds", type=int, default=60)
+    parser.add_argument("--seconds", type=float, default=60.0)
     options = parser.parse_args()
     fitted = fit_entries(list(rs.load_dataset(options.data, "training")))
     print(f"fitted: {len(fitted.entrants.speed_mps)} entrants, weights {np.round(fitted.weights, 3).tolist()}")
-    models = {name: ENTRIES.get(name) for name in ("none", "fixed-rate")} | {"fitted": fitted}
     policy, worlds = load_policy(options.model), rs.load_dataset(options.data, "validation")
-    measured: dict[str, list[list[WindowSamples]]] = defaultdict(list)
-    steps, seconds = 10 * options.seconds, defaultdict(float)
-    for position in range(min(options.worlds, len(worlds))):
-        scenario = worlds[position]
-        measured["log"].append(measure_windows(read_log(scenario).steps(slice(0, steps))))
-        for name, entries in models.items():
+    scenarios, rows = [worlds[position] for position in range(min(options.worlds, len(worlds)))], []
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "entries.npz"
+        write_entries(file, fitted)
+        for name, entries in (("none", "none"), ("fixed-rate", "fixed-rate"), ("fitted", str(file))):
             start = time.process_time()
-            batch = collate([add_visitors(scenario)])
-            rollouts = simulate(
-                policy, batch, num_rollouts=options.num_rollouts, seed=0, num_steps=steps, entries=entries
-            )
-            seconds[name] += time.process_time() - start
-            measured[name] += [measure_windows(motion) for motion in read_rollouts(batch.scenarios[0], rollouts)]
-        print(
-            f"world {position + 1}: {', '.join(f'{name} {value:.0f} s' for name, value in seconds.items())}", flush=True
-        )
+            result = evaluate_windows(
+                policy, scenarios, seconds=options.seconds, name=name, num_rollouts=options.num_rollouts,
+                entries=entries,
+            )  # fmt: skip
+            print(f"{name}: {time.process_time() - start:.0f} s")
+            rows += result.rows()[len(result.log) * bool(rows) :]
     print("|", " | ".join(HEADINGS), "|\n|---|", "--:|" * (len(HEADINGS) - 1), sep="")
-    windows = {name: [join_samples(of_window) for of_window in zip(*samples)] for name, samples in measured.items()}
-    for name, samples in windows.items():
-        for window, (of_world, of_log) in enumerate(zip(samples, windows["log"])):
-            print("|", " | ".join(table_row(name, window, of_world, of_log)), "|")
+    for row in rows:
+        print("|", " | ".join(row), "|")
 
 
 if __name__ == "__main__":

@@ -3,23 +3,49 @@
 import os
 import tempfile
 from pathlib import Path
-from typing import Literal
+from typing import Literal, overload
+
+from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.evaluation.windows import HEADINGS, WindowEvaluation, evaluate_windows
+from rlftsim.jobs.files import write_text
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.hub import pin_model
 from rlftsim.policies.registry import load_policy_or_oracle, with_guidance
-from rlftsim.rollout.policy import Sampling
+from rlftsim.rollout.policy import Sampling, frozen_copy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
-from rlftsim.verbs.inputs import find_policy_name, to_policy, to_sampling, with_checked_arguments
+from rlftsim.verbs.inputs import (
+    check_left_out,
+    find_policy_name,
+    to_policy,
+    to_sampling,
+    with_checked_arguments,
+)
+
+BY_METRIC = ("metric", "goals", "jobs", "guidance_scale", "rollouts_per_pass", "work")
+"""Arguments without effect on rollouts of another length, which are held against the log by windows."""
 
 
+@overload
+def evaluate(
+    policy: Model, data: Data, *, name: str | None = ..., out: File | None = ..., num_rollouts: int = ...,
+    seed: int = ..., seconds: None = None, limit: int | None = ..., metric: Metric = ...,
+    sampling: Sampling | None = ..., goals: Literal["none", "logged"] = ..., jobs: int = ..., split: str | None = ...,
+    device: Device = ..., guidance_scale: float = ..., rollouts_per_pass: int = ..., work: Work = ...,
+) -> Evaluation: ...  # fmt: skip
+@overload
+def evaluate(
+    policy: Model, data: Data, *, name: str | None = ..., out: File | None = ..., num_rollouts: int = ...,
+    seed: int = ..., seconds: float, entries: str | None = ..., limit: int | None = ...,
+    sampling: Sampling | None = ..., split: str | None = ..., device: Device = ...,
+) -> WindowEvaluation: ...  # fmt: skip
 @with_checked_arguments
 def evaluate(
     policy: Model,
@@ -29,6 +55,8 @@ def evaluate(
     out: File | None = None,
     num_rollouts: int = 32,
     seed: int = 0,
+    seconds: float | None = None,
+    entries: str | None = None,
     limit: int | None = None,
     metric: Metric = "2025",
     sampling: Sampling | None = None,
@@ -39,11 +67,12 @@ def evaluate(
     guidance_scale: float = 1.0,
     rollouts_per_pass: int = 8,
     work: Work = Work(),  # noqa: B008
-) -> Evaluation:
+) -> Evaluation | WindowEvaluation:
     """Evaluate a model with the official realism meta-metric, by 32 rollouts of every held-out scenario.
 
     Writes the results of each scenario to OUT/NAME.parquet. An interrupted evaluation continues when the same command
-    is repeated.
+    is repeated. Rollouts of a minute are held against the log in windows of 10 s instead: density, speed, gaps,
+    collisions and entries, in OUT/NAME.csv.
 
     Args:
         policy: Run, model folder, registered name such as "constant_velocity", or "oracle" (the log itself: the
@@ -55,6 +84,9 @@ def evaluate(
         out: Folder for the results. In Python they may be in memory alone.
         num_rollouts: Rollouts per scenario; the official metric is defined for 32.
         seed: Seed of all randomness. The same seed gives the same scores.
+        seconds: Length of long rollouts, a multiple of 10, of worlds whose logs are as long (`rlftsim synthesize
+            --seconds 70`); left out, the 8 seconds of the metric.
+        entries: Who enters a long world, as in `rlftsim simulate`; left out, nobody enters or leaves.
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
         metric: Year of the meta-metric, or "2025-scenario-gen" for the challenge in which whole scenes are made: agents
             but the ego begin at states drawn from the lanes, see docs/scenario_generation.md.
@@ -70,7 +102,7 @@ def evaluate(
         work: Machines that share the work.
 
     Returns:
-        One row of scores per scenario; see `compare` for two of them.
+        One row of scores per scenario; see `compare` for two of them. With `seconds` samples of each window.
 
     Raises:
         ConfigError: A setting out of range, or goals for a policy that is not goal-conditioned.
@@ -85,6 +117,10 @@ def evaluate(
     )  # fmt: skip
     if guidance_scale != 1.0 and goals == "none":
         raise ConfigError(f"--guidance-scale {guidance_scale:g} has no effect without goals: add --goals logged.")
+    if seconds is not None:
+        check_left_out(evaluate, locals(), BY_METRIC, "has no effect on long rollouts: leave it out, or seconds.")
+    elif entries is not None:
+        raise ConfigError("entries has no effect on the 8 s of the metric: name the seconds, or leave it out.")
     # 2. The policy and its name.
     if isinstance(policy, str | os.PathLike):
         name = name or evaluation.evaluation_name(pin_model(policy))
@@ -93,6 +129,18 @@ def evaluate(
         model = to_policy(policy, device)
         name = name or find_policy_name(model)
     model = with_guidance(model, guidance_scale)
+    if seconds is not None:
+        if isinstance(model, str):
+            raise ConfigError("the oracle has no long rollouts: the log is in every table, name a model.")
+        scenarios = to_scenarios(data, split)
+        chosen = [scenarios[position] for position in range(len(scenarios))[:limit]]
+        result = evaluate_windows(
+            frozen_copy(model), chosen, seconds=seconds, name=name, num_rollouts=num_rollouts, seed=seed,
+            sampling=sampling, entries=entries,
+        )  # fmt: skip
+        if out is not None:
+            write_text(Path(out) / f"{name}.csv", "".join(f"{','.join(row)}\n" for row in (HEADINGS, *result.rows())))
+        return result
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)
     source = dataset_folder(data) if isinstance(data, str | os.PathLike) else to_scenarios(data)
@@ -104,16 +152,22 @@ def evaluate(
         return evaluation.evaluate(model, source, out, config, name=name, runner=runner)
 
 
-def print_evaluation(result: Evaluation, *, out: Path) -> None:
+def print_evaluation(result: Evaluation | WindowEvaluation, *, out: Path) -> None:
     """Print the table, and the scenarios without scores.
 
     Args:
-        result: Scores of the policy, a row per scenario.
+        result: Scores of the policy, a row per scenario, or samples of windows.
         out: Folder of the result, see `evaluate`.
 
     Raises:
         DataError: No scenario could be scored.
     """
+    if isinstance(result, WindowEvaluation):
+        table = Table(*HEADINGS)
+        for row in result.rows():
+            table.add_row(*row)
+        print_wide(table)
+        return print_line(f"{out / result.name}.csv")
     if not len(result):
         raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
     print_wide(format_table(result))

@@ -1,0 +1,72 @@
+"""Long rollouts held against the log of the same world, by windows of 10 s."""
+
+import numpy as np
+import pytest
+
+import rlftsim as rs
+import scenes
+from rlftsim.cli.main import main
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.windows import Motion, measure_windows
+from rlftsim.scenario.types import HISTORY_STEPS
+
+
+@pytest.fixture
+def long_road(monkeypatch):
+    """A road on which everybody keeps the speed for 20 s."""
+    monkeypatch.setattr(scenes, "TOTAL_STEPS", HISTORY_STEPS + 200)
+    movers = (scenes.Mover(speed_mps=5.0), scenes.Mover(x_m=20.0, speed_mps=5.0), scenes.Mover(x_m=40.0, speed_mps=0.0))
+    return scenes.build_scenario("long", movers, scenes.straight_map())
+
+
+def test_samples_of_a_world_that_is_known():
+    steps = np.arange(200)
+    x = np.stack([0.0 * steps, 20.0 + 0.2 * steps, np.full(200, 30.0)])  # the second passes the third at 5 s
+    motion = Motion(
+        position=np.stack([x, np.zeros_like(x)], -1),
+        heading=np.zeros_like(x),
+        size=np.full((3, 2), 2.0),
+        valid=np.ones(x.shape, bool),
+        is_vehicle=np.ones(3, bool),
+        ego=0,
+    )
+    motion.valid[2, 100:150] = False
+    first, second = measure_windows(motion)
+    assert (first.density == 2).all()
+    assert second.density.mean() == pytest.approx(1.5, abs=0.06)  # the third is away for half of it
+    np.testing.assert_allclose(first.speed, 2.0)
+    assert first.collisions.sum() == 2  # both
+    assert second.collisions.sum() == 0
+    assert (first.entries.sum(), second.entries.sum()) == (0, 1)
+    assert first.agent_minutes.sum() == pytest.approx(0.5)
+    assert first.gap.max() == pytest.approx(10.0)
+
+
+def test_who_drives_as_the_log_has_ratios_of_one(long_road, tmp_path):
+    result = rs.evaluate("constant_velocity", [long_road], num_rollouts=2, seconds=20.0, out=tmp_path)
+    assert [row[:2] for row in result.rows()] == [
+        [name, window] for name in ("log", "constant_velocity") for window in ("0-10", "10-20")
+    ]
+    for row in result.rows()[2:]:
+        assert all("(1.00)" in row[column] for column in (2, 3, 4, 7))
+        assert row[5] == "0.00"
+    assert (tmp_path / "constant_velocity.csv").read_text().count("\n") == 5
+
+
+def test_what_cannot_be_held_against_the_log_is_refused_in_one_line(long_road, tmp_path, capsys):
+    command = ["evaluate", "constant_velocity", "--data", "synthetic", "--out", str(tmp_path / "out")]
+    assert main([*command, "--seconds", "60"]) == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "its log goes on for 8.0 s, too short to hold 60 s against: rlftsim synthesize --seconds 70" in printed
+    assert not (tmp_path / "out").exists()
+    for settings, reason in (
+        ({"seconds": 15.0}, "windows last 10 s"),
+        ({"seconds": 10.0, "jobs": 2}, "jobs has no effect on long rollouts"),
+        ({"entries": "none"}, "name the seconds"),
+    ):
+        with pytest.raises(ConfigError, match=reason):
+            rs.evaluate("constant_velocity", [long_road], **settings)
+    with pytest.raises(ConfigError, match="oracle"):
+        rs.evaluate("oracle", [long_road], seconds=10.0)
+    with pytest.raises(DataError, match="too short"):
+        rs.evaluate("constant_velocity", [scenes.straight_road()], seconds=30.0)
