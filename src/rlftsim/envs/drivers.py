@@ -9,6 +9,9 @@ from jaxtyping import Bool, Int64
 
 from rlftsim.envs.scene import Scene
 from rlftsim.errors import ConfigError, in_short
+from rlftsim.rollout.entries import EntryModel, load_entries
+from rlftsim.rollout.open_world import check_decisions
+from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.types import ObjectType
 
 
@@ -83,3 +86,27 @@ def _find_members(scene: Scene, group: str | int) -> Bool[np.ndarray, "A"]:
         f"drivers of {group!r}: scenario {scene.scenario.scenario_id} has no such agents: name ego, tracks_to_predict, "
         f"{', '.join(GROUPS)}, '*' or one of {ids}."
     )
+
+
+def load_open_traffic(entries: str | None, rules: Rules, policy: Policy | None) -> EntryModel | None:
+    """Model of who enters the traffic; None = nobody enters or leaves.
+
+    Args:
+        entries: Name of the model, see `EnvConfig.entries`.
+        rules: Agents to driver, the first match wins.
+        policy: Traffic model; None where no agent follows one.
+
+    Raises:
+        ConfigError: Agents that do not follow the policy, groups of agents that a planner drives, decisions of another
+            length than half a second, or no such model.
+    """
+    if entries is None:
+        return None
+    groups = {driver for who, driver in rules.items() if who in GROUPS or who == "*"}
+    if policy is None or groups != {"policy"} or not {*rules.values()} <= {"planner", "policy"}:
+        raise ConfigError(
+            f"entries={entries} needs traffic that follows the policy, and a planner whose agents are named one by "
+            "one: leave out other drivers, or entries."
+        )
+    check_decisions(policy.steps_per_decision)
+    return load_entries(entries)

@@ -9,7 +9,7 @@ import numpy as np
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.record import build_record
 from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
-from rlftsim.envs.result import Result, build_animation, build_page
+from rlftsim.envs.result import Result, build_animation, build_page, build_result
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, format_observation, observation_space
@@ -136,7 +136,7 @@ class EgoEnv(gymnasium.Env):
 
     def result(self) -> Result:
         """Scores of the episode so far."""
-        return Result(build_record(self.episode, self.state))
+        return build_result(self.episode, self.state)
 
     def render(self) -> Any:
         """Picture of the scene [height, width, 3], or a page that plays the episode so far, by `render_mode`."""

@@ -25,9 +25,8 @@ from rlftsim.envs.dangers import Event, StepView, find_event
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.planners.batch import act_together, acts_together
 from rlftsim.envs.planners.registry import Planner, PlannerFailure, guard_planner, read_action_settings, to_planner
-from rlftsim.envs.record import build_record
 from rlftsim.envs.resets import describe_start
-from rlftsim.envs.result import Result
+from rlftsim.envs.result import Result, build_result
 from rlftsim.envs.source import Source
 from rlftsim.envs.splitting import estimate_interval, split
 from rlftsim.envs.world import Dice, with_dice
@@ -296,7 +295,7 @@ class FailureChain:
                 f"scenario {self.scenario_id}: the planner drives otherwise than when it failed: its code, weights or "
                 "the traffic have changed, or it draws numbers without a method seed(number)."
             )
-        return Result(build_record(episode, state))
+        return build_result(episode, state)
 
     def _describe(self, path: DrivenPath, probability: float) -> Failure:
         """Failure of a path in which the event happens."""

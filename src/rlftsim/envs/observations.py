@@ -261,10 +261,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     def to_frame(offset):  # without types, which would be read anew at every step
         return offset * rotation if frame == "ego" else offset + position
 
-    is_present = find_presence(world, state, HISTORY + 1)[0]  # [B, A, 11]
-    if world.open_worlds:  # before it entered an agent's row was somebody else's
-        has_left = np.stack(state.has_left[-HISTORY - 1 :], -1)
-        is_present = is_present & ~np.maximum.accumulate(has_left[..., ::-1], -1)[..., ::-1]
+    is_present = _find_history(world, state)  # [B, A, 11]
 
     # 1. Squared distances, infinite where there is nothing to see.
     squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]
@@ -342,6 +339,15 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     masks = {f"{name}_mask": (~is_hidden[name]).view(np.int8) for name in ("route", *distances)}
     history = history[:, 1:].reshape(count, NEIGHBORS, -1)
     return Observation(**arrays, **masks, ego_history=ego_history, neighbors_history=history)
+
+
+def _find_history(world: World, state: WorldState) -> Bool[np.ndarray, "B A 11"]:
+    """True where an agent was there: before it entered, its row was somebody else's."""
+    is_present = find_presence(world, state, HISTORY + 1)[0]
+    if not world.open_worlds:
+        return is_present
+    has_left = np.stack(state.has_left[-HISTORY - 1 :], -1)
+    return is_present & ~np.maximum.accumulate(has_left[..., ::-1], -1)[..., ::-1]
 
 
 def _find_nearest_rows(

@@ -7,8 +7,7 @@ from jaxtyping import Bool
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, Outcome
-from rlftsim.envs.record import build_record
-from rlftsim.envs.result import Result
+from rlftsim.envs.result import build_result
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, whole_number
@@ -97,7 +96,7 @@ def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: 
     """
     note = pick_row(describe_steps(episode, state, outcome), row)
     if outcome.terminated[row] or outcome.truncated[row]:
-        note["result"] = Result(build_record(episode, state, row))
+        note["result"] = build_result(episode, state, row)
     return note
 
 

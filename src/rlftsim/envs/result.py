@@ -7,8 +7,9 @@ from os import PathLike
 
 import numpy as np
 
+from rlftsim.envs.episode import Episode, EpisodeState
 from rlftsim.envs.planner_scores import PlannerScores, missing_scores, score_planner
-from rlftsim.envs.record import Record
+from rlftsim.envs.record import Record, build_record
 from rlftsim.envs.traffic_scores import TrafficScores, score_traffic
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS
 from rlftsim.viewer.film import to_film
@@ -60,6 +61,17 @@ class Result:
             f"Result({self.record.scene.scenario.scenario_id}, {self.record.steps} steps: nuPlan-style "
             f"{scores.nuplan_style:.2f}, PDMS-style {scores.pdms_style:.2f}, {len(self.record.collisions)} contacts)"
         )
+
+
+def build_result(episode: Episode, state: EpisodeState, row: int = 0) -> Result:
+    """What happened up to a state of an episode, and the scores of it.
+
+    Args:
+        episode: Episode that the planner drives in.
+        state: State up to which steps count.
+        row: Index of the agent among the planner-driven agents [M].
+    """
+    return Result(build_record(episode, state, row))
 
 
 def to_scene_motion(record: Record, agents: AgentBoxes) -> SceneMotion:

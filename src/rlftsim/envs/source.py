@@ -6,22 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.drivers import GROUPS
+from rlftsim.envs.drivers import load_open_traffic
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.sumo_traffic import check_sumo
 from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError, in_short, whole_number
-from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
-from rlftsim.rollout.entries import load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.open_world import add_visitors, check_decisions
-from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
-from rlftsim.scenario.batch import collate
+from rlftsim.rollout.policy import Policy, is_goal_conditioned, is_training
 from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, Scenarios, list_scenario_ids
@@ -85,21 +79,13 @@ class Source:
         self.policy = (
             policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
         )
-        self.entries = None if config.entries is None else load_entries(config.entries)
-        if self.entries is not None:
-            groups = {driver for who, driver in self.rules.items() if who in GROUPS or who == "*"}
-            if self.policy is None or groups != {"policy"} or not {*self.rules.values()} <= {"planner", "policy"}:
-                raise ConfigError(
-                    f"entries={config.entries} needs traffic that follows the policy, and a planner whose agents are "
-                    "named one by one: leave out other drivers, or entries."
-                )
-            check_decisions(self.policy.steps_per_decision)
+        self.entries = load_open_traffic(config.entries, self.rules, self.policy)
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
         self.controls: Controls = build_controls(
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
             hard_braking=config.hard_braking,
         )  # fmt: skip
-        self._contexts: OrderedDict[str, Any] = OrderedDict()
+        self._contexts: OrderedDict[str | None, Any] = OrderedDict()
 
     def scenario(self, scenario_id: str) -> Scenario:
         """A scenario by id.
@@ -128,29 +114,21 @@ class Source:
         """
         if goals and (self.policy is None or not is_goal_conditioned(self.policy)):
             raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
-        if self.entries is not None:
-            scenarios = [add_visitors(scenario) for scenario in scenarios]
+        # a single scenario is encoded once for its next episodes, too
+        key = scenarios[0].scenario_id if len(scenarios) == 1 else None
         num_actions = math.ceil(self.config.max_steps / self.controls.steps)
         world = build_world(
             scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
-            context=self._context(scenarios), data=dataset_folder(self.config.data),
+            context=self._contexts.get(key), data=dataset_folder(self.config.data),
             max_steps=num_actions * self.controls.steps, entries=self.entries,
         )  # fmt: skip
+        if key is not None and world.context is not None:
+            self._contexts[key] = world.context
+            self._contexts.move_to_end(key)
+            if len(self._contexts) > KEPT_CONTEXTS:
+                self._contexts.popitem(last=False)
         if not len(world.actors):
             raise ConfigError(
                 f"scenario {scenarios[0].scenario_id}: the planner drives no agent: its ego or ids are not simulated."
             )
         return build_episode(world, self.controls, self.config, goals)
-
-    def _context(self, scenarios: list[Scenario]) -> Any:
-        """Context of a single scenario, reused if among the last contexts; None leaves the encoding to the world."""
-        if self.policy is None or len(scenarios) != 1 or "policy" not in self.rules.values():
-            return None
-        key = scenarios[0].scenario_id
-        if key not in self._contexts:
-            with one_thread(), torch.no_grad():
-                self._contexts[key] = self.policy.encode(collate(scenarios).to(get_device(self.policy)))
-        self._contexts.move_to_end(key)
-        while len(self._contexts) > KEPT_CONTEXTS:
-            self._contexts.popitem(last=False)
-        return self._contexts[key]

@@ -31,13 +31,11 @@ from rlftsim.envs.scene import Lights, Scene, build_env_scene
 from rlftsim.envs.sumo_traffic import SumoScene, SumoState, advance_sumo, begin_sumo, build_sumo_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
-from rlftsim.jobs.threads import one_thread
-from rlftsim.rollout.decisions import check_log_prob, check_numbers, read_poses
+from rlftsim.rollout.decisions import check_log_prob, check_numbers, encode_lights, inference, read_poses
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
-from rlftsim.rollout.open_world import OpenWorld, Presence, make_rng
+from rlftsim.rollout.open_world import OpenWorld, Presence, add_visitors, make_rng
 from rlftsim.rollout.policy import Policy, Sampling, get_device
-from rlftsim.rollout.simulate import encode_lights
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, STEP_S, TOTAL_STEPS, Scenario
@@ -188,14 +186,16 @@ def build_world(
         context: Result of `policy.encode` for these scenarios; None = computed here.
         data: Folder of the data set, which has the worlds that SUMO runs again.
         max_steps: Largest number of steps; replayed agents are gone after their log's end, and lights hold.
-        entries: Model of who enters scenarios with visitors (`open_world.add_visitors`), in which all agents but the
-            planner's follow the policy; None = nobody enters or leaves.
+        entries: Model of who enters; all agents but the planner's then follow the policy. None = nobody enters or
+            leaves.
 
     Raises:
         ConfigError: a rule that does not fit, or agents that follow the policy where `policy` is left out.
         DataError: SUMO is to drive in a scenario without a world.
     """
     num_steps = max(TOTAL_STEPS, HISTORY_STEPS + max_steps)
+    if entries is not None:
+        scenarios = [add_visitors(scenario) for scenario in scenarios]
     scenes = tuple(build_env_scene(scenario, num_steps) for scenario in scenarios)
     batch = collate(scenarios)
     shape = tuple(batch.agent_mask.shape)
@@ -206,7 +206,7 @@ def build_world(
     batch = batch.to(get_device(policy)) if followers else batch
     if followers and context is None:
         assert policy is not None
-        with one_thread(), torch.no_grad():
+        with inference():
             context = policy.encode(batch)
     by_sumo = scenes if (drivers == Driver.SUMO).any() else ()
     if by_sumo and data is None:
@@ -277,7 +277,7 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     block = noise = None
     if world.policy is not None:
         initial = _noise(world, dice, "begin", world.policy.initial_noise_size)
-        with one_thread(), torch.no_grad():
+        with inference():
             policy_state = world.policy.begin(world.context, 1, world.goals, initial)
         presences = tuple(open_world.begin(1) for open_world in world.open_worlds)
         block = Block(policy_state, world.context, None, None, presences)
@@ -466,7 +466,7 @@ def _decide(world: World, state: WorldState) -> Block:
     assert policy is not None
     assert block is not None
     assert state.noise is not None
-    with one_thread(), torch.no_grad():
+    with inference():
         policy_state = block.policy_state
         if block.decision is not None:
             policy_state = policy.advance(block.context, policy_state, block.decision, _forced(world, state))

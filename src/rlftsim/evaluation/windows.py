@@ -5,12 +5,14 @@ A agents, S steps of 0.1 s after the current one, K vehicles that follow another
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.in_memory import simulate_in_memory
+from rlftsim.jobs.files import write_text
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.types import Rollouts
@@ -115,6 +117,10 @@ class WindowEvaluation:
     name: str
     windows: tuple[WindowSamples, ...]
     log: tuple[WindowSamples, ...]
+
+    def write(self, path: Path) -> None:
+        """Write the table as CSV, whole or not at all."""
+        write_text(path, "".join(f"{','.join(row)}\n" for row in (HEADINGS, *self.rows())))
 
     def rows(self) -> list[list[str]]:
         """Cells under `HEADINGS`: the log, then the rollouts with ratios to the log in parentheses."""

@@ -1,8 +1,13 @@
-"""What a policy returns for a decision, checked: a wrong shape or a NaN is told where it arises, by the policy's name.
+"""Around a decision: the lights that a policy sees, and checks of what it returns.
+
+A wrong shape or a NaN is told where it arises, by the policy's name.
 
 B scenarios, N rollouts, A agents, t steps of 0.1 s per decision.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,11 +15,38 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rlftsim.errors import DataError
-from rlftsim.rollout.policy import Policy
+from rlftsim.jobs.threads import one_thread
+from rlftsim.rollout.policy import Policy, relight
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS
 
 MAX_COORDINATE_M = 1e6
 """Farther from the origin of the map frame no agent is."""
+
+RELIT_STEPS = 20
+"""After the metric's 8 s agents see the lights of the log, anew every 2 s; within these they see those of "now"."""
+
+
+@contextmanager
+def inference() -> Iterator[None]:
+    """Without gradient and on one thread, on which the same work gives the same bits on any machine."""
+    with one_thread(), torch.no_grad():
+        yield
+
+
+def encode_lights(policy: Policy, batch: ScenarioBatch, context: Any, step: int) -> Any:
+    """Context with the lights of the log, every 2 s from second 8 on: a signal plan is no future of the agents.
+
+    Args:
+        policy: Policy that encodes.
+        batch: Scenarios of the rollouts.
+        context: Context up to now, which comes back at other steps and where no log has lights any more.
+        step: Simulated step, from 0.
+    """
+    log_step = CURRENT_STEP + step
+    has_lights = any(len(s.lights.step) and log_step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
+    is_due = step >= FUTURE_STEPS and step % RELIT_STEPS == 0
+    return relight(policy, context, replace(batch, light_step=log_step)) if is_due and has_lights else context
 
 
 def read_poses(policy: Policy, state: Any, shape: tuple[int, int, int]) -> Float[Tensor, "B N A t 3"]:

@@ -12,17 +12,15 @@ from torch import Tensor
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
-from rlftsim.rollout.decisions import check_log_prob, check_numbers, read_poses
+from rlftsim.rollout.decisions import check_log_prob, check_numbers, encode_lights, read_poses
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.open_world import OpenRollouts
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device, relight
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenarios
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, Scenarios
 
-RELIT_STEPS = 20
-"""After the metric's 8 s agents see the lights of the log, anew every 2 s; within these they see those of "now"."""
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]
 Observe = Callable[[Float[Tensor, "B N A t 3"]], None]
@@ -147,21 +145,6 @@ def _join_decisions(
         mask = mask & ~all_forced.valid.unflatten(-1, (len(masks), -1)).all(-1)
     log_prob = torch.where(mask, torch.stack(log_probs, dim=3), 0.0)
     return Rollouts(path[..., :2], path[..., 2], torch.stack(decisions, dim=3), mask, log_prob, forced=all_forced)
-
-
-def encode_lights(policy: Policy, batch: ScenarioBatch, context: Any, step: int) -> Any:
-    """Context with the lights of the log, every 2 s from second 8 on: a signal plan is no future of the agents.
-
-    Args:
-        policy: Policy that encodes.
-        batch: Scenarios of the rollouts.
-        context: Context up to now, which comes back at other steps and where no log has lights any more.
-        step: Simulated step, from 0.
-    """
-    log_step = CURRENT_STEP + step
-    has_lights = any(len(s.lights.step) and log_step < s.num_steps + RELIT_STEPS for s in batch.scenarios)
-    is_due = step >= FUTURE_STEPS and step % RELIT_STEPS == 0
-    return relight(policy, context, replace(batch, light_step=log_step)) if is_due and has_lights else context
 
 
 def _draw_decision_noise(

@@ -12,7 +12,6 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.evaluation.windows import HEADINGS, WindowEvaluation, evaluate_windows
-from rlftsim.jobs.files import write_text
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.hub import pin_model
@@ -95,8 +94,7 @@ def evaluate(
         jobs: Processes, each with one thread, on CPUs only. Changes no result.
         split: Split of the data set; None = all scenarios. An opened data set has its own.
         device: Device of a model that is loaded; several processes (--jobs) need cpu.
-        guidance_scale: With --goals logged: factor on the goal-progress bias of the model's logits. Above 1 it follows
-            goals more closely than it learned to.
+        guidance_scale: Factor on the goal-progress bias of the logits, with --goals logged; above 1 goals count more.
         rollouts_per_pass: Rollouts simulated together. Bounds memory and changes no result. A small model, such as
             those that ship, is a quarter to a third faster with 32; SMART-tiny is not.
         work: Machines that share the work.
@@ -132,14 +130,12 @@ def evaluate(
     if seconds is not None:
         if isinstance(model, str):
             raise ConfigError("the oracle has no long rollouts: the log is in every table, name a model.")
-        scenarios = to_scenarios(data, split)
-        chosen = [scenarios[position] for position in range(len(scenarios))[:limit]]
         result = evaluate_windows(
-            frozen_copy(model), chosen, seconds=seconds, name=name, num_rollouts=num_rollouts, seed=seed,
-            sampling=sampling, entries=entries,
+            frozen_copy(model), to_scenarios(data, split, limit), seconds=seconds, name=name,
+            num_rollouts=num_rollouts, seed=seed, sampling=sampling, entries=entries,
         )  # fmt: skip
         if out is not None:
-            write_text(Path(out) / f"{name}.csv", "".join(f"{','.join(row)}\n" for row in (HEADINGS, *result.rows())))
+            result.write(Path(out) / f"{name}.csv")
         return result
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)

@@ -59,6 +59,7 @@ from rlftsim.tokens.map_tokens import (
     NUM_TYPES,
     WINDOW,
     MapTokens,
+    tokenize_lights,
     tokenize_map,
 )
 from rlftsim.tokens.vocabulary import CLASS_NAMES, Vocabulary, class_of_type
@@ -476,14 +477,15 @@ class SmartNetwork(nn.Module):
             max_map_tokens=max_map_tokens,
         )
 
-    def relight(self, scene: Scene, light: Int64[Tensor, "B M"], vocabulary: Vocabulary) -> Scene:
+    def relight(self, scene: Scene, scenarios: ScenarioBatch, vocabulary: Vocabulary) -> Scene:
         """The scene with other traffic lights; features are computed anew as far as a light that changes reaches.
 
         Args:
             scene: Scene of the same maps.
-            light: Light of each map token, as in `MapTokens`.
+            scenarios: Scenarios of the scene, with the step of the lights.
             vocabulary: Prototypes of map tokens.
         """
+        light = tokenize_lights(scenarios, vocabulary.map_prototypes.shape[1])
         is_changed = light != scene.tokens.light
         if not is_changed.any():
             return scene

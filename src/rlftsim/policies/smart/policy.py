@@ -27,7 +27,6 @@ from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, restart_at_log
-from rlftsim.tokens.map_tokens import tokenize_lights
 from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_type
 
 
@@ -150,8 +149,7 @@ class SmartPolicy(SmartModel):
             context: Result of `encode` for the same scenarios.
             scenarios: Scenarios, with the step of the lights.
         """
-        light = tokenize_lights(scenarios, self.vocabulary.map_prototypes.shape[1])
-        scene = self.network.relight(context.scene, light, self.vocabulary)
+        scene = self.network.relight(context.scene, scenarios, self.vocabulary)
         return context if scene is context.scene else replace(context, scene=scene)
 
     def begin(self, context: Context, num_rollouts: int, goals: Goals | None, noise: Tensor) -> State:
