@@ -55,8 +55,12 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         import difflib  # seldom needed
 
+        from rlftsim.verbs.commands import COMMANDS
+
         near = difflib.get_close_matches(name, __all__, n=1, cutoff=0.8)
-        hint = f": did you mean {near[0]!r}?" if near else ""
+        hint = (
+            f": did you mean {near[0]!r}?" if near else ": it is a command, rlftsim " + name if name in COMMANDS else ""
+        )
         raise AttributeError(f"module 'rlftsim' has no attribute {name!r}{hint}")
     value = getattr(importlib.import_module(_MODULE_OF[name]), name)
     if "IPython" in sys.modules:  # a notebook plays scenarios and rollouts that end a cell

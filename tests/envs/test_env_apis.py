@@ -240,6 +240,7 @@ def test_bad_input_of_several_environments_is_one_line(unchecked):
         ({"seed": [1]}, "seed has 1 numbers"),
         ({"seed": (1, "a")}, "seed must be"),
         ({"options": {"reset_mask": np.ones(3, bool)}}, "2 truth values"),
+        ({"options": [{}, {}]}, "options is one dictionary for all slots, .* with reset_mask"),
     ):
         with pytest.raises(ConfigError, match=message):
             vector.reset(**settings)

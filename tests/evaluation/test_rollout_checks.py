@@ -61,6 +61,16 @@ def test_another_frame_is_told_by_scenario_agent_and_distance(warnings_of):
     assert "this one 6000 m from there in rollout 0." in line
 
 
+def test_steps_that_begin_with_the_current_one_are_told(warnings_of):
+    tracks = SCENARIO.tracks
+    late = {
+        axis: torch.from_numpy(values[SCENARIO.simulated_indices, 10:90])[None]
+        for axis, values in zip(("x", "y", "z", "heading"), (*np.moveaxis(tracks.position, -1, 0), tracks.heading))
+    }
+    (line,) = warnings_of(replace(logged_states(SCENARIO, num_rollouts=1), **late))
+    assert "all agents that move begin with the log's current position" in line
+
+
 @pytest.mark.filterwarnings("error")
 def test_positions_whose_squares_no_number_holds_are_far(warnings_of):
     states = logged_states(SCENARIO, num_rollouts=1)

@@ -164,6 +164,8 @@ def test_a_typo_gets_the_nearest_name():
         load_policy("constant_velocty")
     with pytest.raises(ConfigError, match="did you mean 'oracle'"):
         load_policy_or_oracle("oracel")
+    with pytest.raises(ConfigError, match=r"on Hugging Face it is hf://somebody/traffic$"):
+        load_policy("somebody/traffic")
 
 
 @pytest.mark.parametrize("kind", [str, lambda path: path])

@@ -1,6 +1,6 @@
 """Many ego environments at once: scenes that are reset together step together, with a single network call for all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -124,6 +124,11 @@ class EgoVectorEnv(VectorEnv):
         Raises:
             ConfigError: an unknown option or scenario.
         """
+        if not isinstance(options, Mapping | None):
+            raise ConfigError(
+                f"options is one dictionary for all slots, got {in_short(options)}: for different scenarios reset the "
+                "slots in turn, with reset_mask."
+            )
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:

@@ -12,6 +12,7 @@ from pathlib import Path
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation
+from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_states import Oracle, simulate_evaluated
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.jobs.items import group_positions, run_items
@@ -146,6 +147,8 @@ def _evaluate_group(
             results.append(Skipped(scenario.scenario_id, str(error)))
         else:
             states = simulate_evaluated(policy, collate([scenario]), config)
+            if position == 0:  # a wrong unit or frame shows in any scenario
+                warn_of_doubts(scenario, states, f"rollouts of {type(policy).__name__}")
             result = score(log, states, metric_by_name(config.metric))
             results.append(row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id)))
         advance(1)

@@ -32,7 +32,7 @@ MAX_FIRST_STEP_ERROR_M = 3.0
 """Between the first simulated position and that of constant velocity, or the current one if it is nearer."""
 MOVING_MPS = 0.5
 
-Subject = Literal["not finite", "distance", "heading", "turn", "height", "start", "equal"]
+Subject = Literal["not finite", "distance", "heading", "turn", "height", "start", "equal", "offset"]
 ALLOWED = ("equal", "turn")
 """Subjects that `score` passes over: a policy may be deterministic, and headings of real logs do jump by a turn."""
 
@@ -146,6 +146,11 @@ class PoseChecks:
         is_moving = np.atleast_2d(np.hypot(self.velocity[..., 0], self.velocity[..., 1]) > MOVING_MPS).any(0)  # [A]
         if is_moving.any() and (poses[:, is_moving, :2] == poses[:1, is_moving, :2]).all():
             yield Doubt("equal", f"all {len(poses)} rollouts are equal: the metric compares distributions")
+        if poses.shape[-1] < TOTAL_STEPS and is_moving.any():
+            path = poses[:, is_moving, :2]  # [N, a, 2, 80]
+            if (path[..., 0] == start[is_moving, :2]).all() and (path[..., 1] != path[..., 0]).any(-1).all():
+                text = "all agents that move begin with the log's current position: the first step is 0.1 s later"
+                yield Doubt("offset", f"{text} (off by a step?)")
 
     @np.errstate(over="ignore", invalid="ignore")
     def _facing_doubts(self) -> Iterator[Doubt]:

@@ -53,8 +53,9 @@ class SimulatedStates:
             values = getattr(self, name)
             if tuple(values.shape) != expected_shape or values.dtype != torch.float32:
                 raise DataError(
-                    f"Simulated {name} must be float32 of shape [N, A = {len(self.object_id)}, T = {num_steps}], "
-                    f"got {values.dtype} {list(values.shape)}: one row per object id, {num_steps} steps at 10 Hz."
+                    f"Simulated {name} must be a float32 tensor [N, A = {len(self.object_id)}, T = {num_steps}], got a "
+                    f"{type(values).__name__} of {values.dtype} {list(values.shape)}: one row per object id, "
+                    f"{num_steps} steps at 10 Hz."
                 )
         if self.repeat < 1 or expected_shape[0] < 1:
             raise DataError(f"At least one rollout is needed, got {expected_shape[0]} x repeat {self.repeat}.")

@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlftsim.errors import RlftsimError
+from rlftsim.errors import DataError, RlftsimError
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout import edge_scenes
 from rlftsim.rollout.contract import (
     CheckReport,
+    CheckResult,
     RuleBroken,
     RuleNotApplicable,
     check_gap,
@@ -73,10 +74,15 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         reference: Policy of the same architecture for KL divergences; None = a copy with perturbed weights.
 
     Returns:
-        A result per rule. A rule with an error in the check counts as failed, with the error as detail.
+        A result per rule. A rule with an error in the check counts as failed, with the error as detail. A policy that
+        cannot be simulated fails at that alone.
     """
-    rules = Rules(_copy_for_evaluation(policy), tuple(scenarios), reference)
-    return check_rules(rules, type(policy).__name__)
+    rules, name = Rules(_copy_for_evaluation(policy), tuple(scenarios), reference), type(policy).__name__
+    try:
+        _ = rules.rollouts
+    except DataError as error:  # which every rule would repeat
+        return CheckReport(name, (CheckResult("can be simulated", "failed", str(error)),))
+    return check_rules(rules, name)
 
 
 def _copy_for_evaluation(policy: Policy) -> Policy:

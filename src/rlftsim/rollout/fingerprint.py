@@ -1,12 +1,17 @@
 """Fingerprints of policies: hashes of weights and settings, equal for equal policies on any device."""
 
 import hashlib
+import inspect
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from rlftsim.plugins import is_ours
 
 
 def fingerprint_policy(policy: object) -> str:
@@ -14,7 +19,8 @@ def fingerprint_policy(policy: object) -> str:
 
     Moving code must leave the fingerprints of stored models valid. So a class is hashed under the declared name,
     `fingerprint_name` or else `architecture`, and without either under module and name. Classes of nested settings
-    count too. A base class's name does not stand for a subclass, which is different code.
+    count too. A base class's name does not stand for a subclass, which is different code. Of a policy of another
+    package without a `fingerprint_name` the file counts that defines it, as an edit may make it decide otherwise.
 
     Args:
         policy: Policy of any class; the bytes of weights count, whatever the device.
@@ -24,6 +30,10 @@ def fingerprint_policy(policy: object) -> str:
     """
     digest = hashlib.blake2b(digest_size=16)
     _feed(digest, policy)
+    cls = type(policy)
+    if not is_ours(cls) and "fingerprint_name" not in vars(cls):
+        with suppress(TypeError, OSError):  # in a notebook there is no file
+            digest.update(Path(inspect.getfile(cls)).read_bytes())
     return digest.hexdigest()
 
 

@@ -65,7 +65,7 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
         if not files:
             raise DataError(
                 f"{path}: no tfrecord file in this folder (names like x.tfrecord or x.tfrecord-00000-of-00010), "
-                "and no other source recognizes it: name one to learn what it misses (--from av2, --from tables)"
+                "and no other source recognizes it: name one to learn what it misses (--from av2, gpudrive, tables)"
             )
         return files
     files = sorted(Path(name) for name in glob.glob(str(source), recursive=True) if os.path.isfile(name))

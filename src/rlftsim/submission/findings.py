@@ -44,8 +44,16 @@ CHECKS = {
 """Title of each check. The 18th of docs/submission.md, a server error without a reason, cannot be checked."""
 SAME_M = 1e-3
 """A generated agent this near to its log at every logged step of the history repeats it."""
-_CHECK_OF_SUBJECT = {"not finite": 10, "distance": 10, "heading": 11, "turn": 11, "height": 12, "equal": 14}
-"""The first step, 13, is judged over all scenarios."""
+_CHECK_OF_SUBJECT = {
+    "not finite": 10,
+    "distance": 10,
+    "heading": 11,
+    "turn": 11,
+    "height": 12,
+    "offset": 13,
+    "equal": 14,
+}
+"""The place of the first step, 13, is judged over all scenarios."""
 MAX_STORED = 10
 """Findings of a check that are stored; further findings are counted."""
 

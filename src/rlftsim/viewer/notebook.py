@@ -84,7 +84,10 @@ def check_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
     for argument in rollouts:
         if not isinstance(argument, Rollouts) or isinstance(scenarios, Rollouts):
             types = ", ".join(type(value).__name__ for value in (scenarios, *rollouts))
-            raise ConfigError(f"write rs.{function}(scenario, rollouts), got ({types}).")
+            raise ConfigError(
+                f"write rs.{function}(scenario, rollouts) with rollouts of rs.simulate, got ({types}): arrays of "
+                "another simulator go through files, see docs/rollout_formats.md."
+            )
         poses = (argument.position, argument.heading)
         are_tensors = all(isinstance(values, Tensor) for values in poses) and argument.heading.dim() == 4
         if not are_tensors or argument.position.shape != (*argument.heading.shape, 2):
