@@ -4,10 +4,9 @@ An event of your own is an object with `danger(view) -> float`. Splitting (`envs
 and cheap for a good one: of two moments the one with the greater danger should be likelier to end in the event.
 
 The danger of a contact is minus the number of standard deviations by which another agent has to depart from its speed
-and turn rate so that both meet within 3 s. It is counted twice: if the planner goes on as now, which sees conflicts
-early, and if it brakes, which ranks those that a planner answers by braking anyway. The geometric mean of both, with
-weights 3 to 1, told failing episodes from others best, 1 and 2 s before the contact. Frame: map, meters, seconds; K
-other agents.
+and turn rate so that both surely meet within 3 s. The planner is expected along its route: where it turns across the
+way of others, its present motion shows the conflict a second late. Both go on with their present acceleration for 2 s,
+so a planner that brakes in time is in no danger. Frame: map, meters, seconds; K other agents.
 """
 
 from dataclasses import dataclass, replace
@@ -31,19 +30,23 @@ NEVER = -np.inf
 """Danger where nothing can happen."""
 NEARLY = -1e-6
 """Largest danger of an event that has not happened."""
-AHEAD_S = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0])
+AHEAD_S = np.arange(0.0, 3.01, 0.25)
+HOLD_S = 2.0
+"""Time for which an acceleration goes on."""
+EASE_M = 8.0, 4.0
+"""Ways after which an offset from the route and one of the heading have fallen to 1/e."""
 MOVING = (1.5, 0.25, 0.15)
 """Standard deviations of a moving agent: acceleration (m/s²), drift to the side (m/s), position even at once (m)."""
 STANDING = (0.3, 0.0, 0.1)
 """Of an agent that stands; a parked one beside the path must not hide what else happens."""
 STANDING_MPS = 0.5
-SIGMA_PER_S = 0.5
+SIGMA_PER_S = 0.25
 """What a second until the contact counts, in standard deviations."""
-GOES_ON = 0.75
-"""Weight of a planner that goes on, against one that brakes."""
+SURE = 2.0
+"""Standard deviations inside a box from which on a contact is sure, and only the time until then counts."""
 REACH_M = 60.0
-TURN_STEPS = 3
-"""Steps that turn rates are measured over."""
+TURN_STEPS, SPEED_STEPS = 3, 5
+"""Steps that turn rates and accelerations are measured over."""
 _SIDE = np.linspace(-0.5, 0.5, 5)
 _FRONT = np.stack([np.full(5, 0.5), _SIDE], -1)
 _OUTLINE = np.concatenate([_FRONT, *(np.stack([_SIDE[:4], np.full(4, y)], -1) for y in (-0.5, 0.5)), [[-0.5, 0.0]]])
@@ -123,39 +126,75 @@ class Contact:
     """True = only contacts that are its fault count, see `contact.classify_collision`."""
 
     def danger(self, view: StepView) -> float:
-        """0 from the contact on; before, minus the mean number of standard deviations, see the module."""
+        """0 from the contact on; before, minus the least of `costs`."""
         if any(collision.at_fault or not self.at_fault for collision in view.collisions):
             return 0.0
-        costs = self.costs(view)
-        return min(-float((costs[0] ** GOES_ON * costs[1] ** (1 - GOES_ON)).min()), NEARLY) if costs.size else NEVER
+        return min(-float(self.costs(view).min(initial=np.inf)), NEARLY)
 
-    def costs(self, view: StepView) -> Float[np.ndarray, "2 K"]:
-        """Standard deviations to a contact with each agent near, if the planner goes on as now, and if it brakes."""
+    def costs(self, view: StepView) -> Float[np.ndarray, "K"]:
+        """Standard deviations to a contact with each agent near, beyond those that make one sure."""
         rows, (scene, agent) = view.others(REACH_M), view.index
         track, world_size = view.state.world.track, view.episode.world.size[scene]
-        now, before = track[-1][scene], track[-1 - TURN_STEPS][scene]
-        turn_rate = wrapped(now[:, 2] - before[:, 2]) / (TURN_STEPS * STEP_S)
-        turn_rate = np.where(np.hypot(now[:, 3], now[:, 4]) < STANDING_MPS, 0.0, turn_rate)
-        other, size, time = now[rows], world_size[rows], AHEAD_S[:, None]
-        # 1. poses of the planner that goes on and of one that brakes, and of the others
-        speed = max(float(signed_speed(now[agent][None])[0]), 0.0)
-        driving_s = np.stack([AHEAD_S, np.minimum(AHEAD_S, speed / ACCELERATION_MPS2)])  # [2, t]
-        driven = np.stack([speed * AHEAD_S, speed * driving_s[1] - ACCELERATION_MPS2 / 2 * driving_s[1] ** 2])
-        ego = _arc(now[agent], driven, turn_rate[agent] / max(speed, STANDING_MPS) * driven)  # [2, t, 3]
-        other_speed = np.hypot(other[:, 3], other[:, 4])
-        path = _arc(other, other_speed * time, turn_rate[rows] * time)  # [t, K, 3]
+        now, time = track[-1][scene], AHEAD_S[:, None]
+        speed, before = (np.maximum(signed_speed(track[-1 - k][scene]), 0.0) for k in (0, SPEED_STEPS))
+        acceleration = np.clip((speed - before) / (SPEED_STEPS * STEP_S), -ACCELERATION_MPS2, ACCELERATION_MPS2)
+        turn = wrapped(now[:, 2] - track[-1 - TURN_STEPS][scene][:, 2]) / (TURN_STEPS * STEP_S)
+        curvature = np.where(speed < STANDING_MPS, 0.0, turn / np.maximum(speed, STANDING_MPS))
+        # 1. poses of the planner and of the others
+        driven = _drive(speed, acceleration, time)  # [t, A]
+        route = view.episode.atlas.routes[view.row].points
+        if len(route) > 1:
+            ego = _follow(route, now[agent], driven[:, agent])
+        else:
+            ego = _arc(now[agent], driven[:, agent], curvature[agent] * driven[:, agent])  # [t, 3]
+        other, size, other_driven = now[rows], world_size[rows], driven[:, rows]
+        path = _arc(other, other_driven, curvature[rows] * other_driven)  # [t, K, 3]
         # 2. standard deviations ahead of the others, behind them, and to their sides; who brakes does not back up
-        is_standing = other_speed < STANDING_MPS
-        acceleration, drift, position = np.where(is_standing[:, None], STANDING, MOVING).T
-        ahead = acceleration * time**2 / 2
-        sigma = position + np.stack([ahead, np.minimum(ahead, other_speed * time), drift * time])  # [3, t, K]
-        distance = _distances(ego, _OUTLINE * view.ego_size, path, size, sigma)  # [2, t, K, p]
+        is_standing = speed[rows] < STANDING_MPS
+        deviation, drift, position = np.where(is_standing[:, None], STANDING, MOVING).T
+        ahead = deviation * time**2 / 2
+        sigma = position + np.stack([ahead, np.minimum(ahead, other_driven), drift * time])  # [3, t, K]
+        distance = _distances(ego, _OUTLINE * view.ego_size, path, size, sigma)  # [t, K, p]
         if not self.at_fault:
-            return (distance.min(-1) + SIGMA_PER_S * time).min(1)
+            return (distance.min(-1) + SIGMA_PER_S * time).min(0)
         # 3. the planner is to blame while it moves: for what its front meets, and for standing ones anywhere
         nearest = np.where(is_standing, distance.min(-1), distance[..., : len(_FRONT)].min(-1))
-        is_moving = (speed > STOPPED_MPS) & (driving_s >= AHEAD_S)
-        return np.where(is_moving[..., None], nearest + SIGMA_PER_S * time, np.inf).min(1)
+        is_moving = speed[agent] + acceleration[agent] * np.minimum(time, HOLD_S) > STOPPED_MPS
+        return np.where(is_moving, nearest + SIGMA_PER_S * time, np.inf).min(0)
+
+
+def _drive(
+    speed: Float[np.ndarray, "A"], acceleration: Float[np.ndarray, "A"], time_s: Float[np.ndarray, "t 1"]
+) -> Float[np.ndarray, "t A"]:
+    """Meters driven with an acceleration that goes on for a while, at most down to standstill."""
+    stop_s = speed / np.maximum(-acceleration, 1e-6)
+    held = np.minimum(np.minimum(time_s, HOLD_S), np.where(acceleration < 0, stop_s, np.inf))
+    return (
+        speed * held
+        + acceleration / 2 * held**2
+        + np.maximum(speed + acceleration * HOLD_S, 0.0) * (np.maximum(time_s - HOLD_S, 0.0))
+    )
+
+
+def _follow(
+    route: Float[np.ndarray, "R 2"], pose: Float[np.ndarray, "5"], driven: Float[np.ndarray, "t"]
+) -> Float[np.ndarray, "t 3"]:
+    """x, y, heading after some meters along a route, which is eased into from beside it."""
+    step = np.diff(route, axis=0)
+    length, direction = np.hypot(*step.T), np.arctan2(step[:, 1], step[:, 0])
+    fraction = np.clip(((pose[:2] - route[:-1]) * step).sum(1) / length**2, 0.0, 1.0)
+    offset = pose[:2] - route[:-1] - fraction[:, None] * step
+    nearest = int((offset**2).sum(1).argmin())
+    along = np.concatenate([[0.0], np.cumsum(length)])
+    begin = along[nearest] + fraction[nearest] * length[nearest]
+    at = begin + driven
+    x, y = (np.interp(at, along, route[:, axis]) for axis in range(2))
+    heading = np.interp(np.append(at, begin), (along[1:] + along[:-1]) / 2, np.unwrap(direction))
+    aside = np.cos(direction[nearest]) * offset[nearest, 1] - np.sin(direction[nearest]) * offset[nearest, 0]
+    beyond, aside = np.maximum(at - along[-1], 0.0), aside * np.exp(-driven / EASE_M[0])
+    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
+    turned = wrapped(pose[2:3] - heading[-1]) * np.exp(-driven / EASE_M[1])
+    return np.stack([x + beyond * cos - aside * sin, y + beyond * sin + aside * cos, heading[:-1] + turned], -1)
 
 
 def _arc(
@@ -169,23 +208,22 @@ def _arc(
 
 
 def _distances(
-    ego: Float[np.ndarray, "2 t 3"],
+    ego: Float[np.ndarray, "t 3"],
     points: Float[np.ndarray, "p 2"],
     other: Float[np.ndarray, "t K 3"],
     size: Float[np.ndarray, "K 2"],
     sigma: Float[np.ndarray, "3 t K"],
-) -> Float[np.ndarray, "2 t K p"]:
-    """Distances of points of the planner's box to other boxes, in standard deviations along and across the others."""
+) -> Float[np.ndarray, "t K p"]:
+    """Standard deviations, along and across the others, by which points of the planner's box are not surely in them."""
     cos, sin = np.cos(ego[..., 2, None]), np.sin(ego[..., 2, None])
-    x = ego[..., 0, None] + cos * points[:, 0] - sin * points[:, 1]  # [2, t, p]
+    x = ego[..., 0, None] + cos * points[:, 0] - sin * points[:, 1]  # [t, p]
     y = ego[..., 1, None] + sin * points[:, 0] + cos * points[:, 1]
-    dx, dy = x[:, :, None] - other[..., :1], y[:, :, None] - other[..., 1:2]  # [2, t, K, p]
+    dx, dy = x[:, None] - other[..., :1], y[:, None] - other[..., 1:2]  # [t, K, p]
     along, across = to_heading_frame(dx, dy, other[..., 2:])
-    off_x = np.maximum(np.abs(along) - size[:, :1] / 2, 0.0) / np.where(
-        along > 0, sigma[0, ..., None], sigma[1, ..., None]
-    )
-    off_y = np.maximum(np.abs(across) - size[:, 1:] / 2, 0.0) / sigma[2, ..., None]
-    return np.hypot(off_x, off_y)
+    off_x = (np.abs(along) - size[:, :1] / 2) / np.where(along > 0, sigma[0, ..., None], sigma[1, ..., None])
+    off_y = (np.abs(across) - size[:, 1:] / 2) / sigma[2, ..., None]
+    outside = np.hypot(np.maximum(off_x, 0.0), np.maximum(off_y, 0.0))
+    return SURE + outside + np.clip(np.maximum(off_x, off_y), -SURE, 0.0)
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,9 @@ class FailureChain:
             rows = order[first : first + BATCH]
             paths[rows] = self.run(dice[rows], blocks[rows], parents[rows])[0]
         danger = np.stack([path.danger for path in paths])
-        in_blocks = danger[:, 1:].reshape(len(paths), self.num_blocks, -1).max(2)
+        in_blocks = danger[:, 1:].reshape(len(paths), self.num_blocks, -1)
+        # a branch begins at the end of a block: what threatened before and has passed does not count
+        in_blocks = np.where((in_blocks >= 0).any(2), in_blocks.max(2), in_blocks[..., -1])
         # the start is the same for all: its danger would tie them
         return paths, np.concatenate([np.full((len(paths), 1), -np.inf), in_blocks], 1)
 
