@@ -213,7 +213,7 @@ def open_env(policy, crossing):
 
 def test_an_open_world_that_the_policy_drives_alone_is_a_simulation(policy, crossing):
     scenario, entries = add_visitors(crossing), load_entries("fixed-rate")
-    world = build_world([scenario], policy, rules={"*": "policy"}, max_steps=150, entries=entries)
+    world = build_world([crossing], policy, rules={"*": "policy"}, max_steps=150, entries=entries)
     state = begin(world, [Dice(5, 2)])
     for _ in range(150):
         state = step_world(world, state, np.zeros((0, 5)))

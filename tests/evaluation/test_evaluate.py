@@ -321,7 +321,7 @@ class Loses(ConstantVelocity):
 @pytest.mark.parametrize("agent", [0, 2])
 def test_a_policy_whose_poses_are_not_finite_is_refused(data, agent):
     ids = scenes.straight_road().tracks.object_id
-    message = f"object id {ids[agent]} of scenario straight in rollout 0 at future step 0 is not finite"
+    message = f"Loses moves agent {ids[agent]} of scenario straight in rollout 0 at step 0 to x nan m"
     with pytest.raises(DataError, match=message):
         evaluate(Loses(agent=agent), data, None, replace(CONFIG, limit=1), name="loses")
 

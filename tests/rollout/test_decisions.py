@@ -59,8 +59,8 @@ FAULTS = {
     "a list": r"Faulty.advance gives a list as poses",
     "two steps": r"gives float32 \[1, 1, \d+, 2, 3\] as poses: .* = \[1, 1, \d+, 1, 3\]",
     "double": r"gives float64 .* as poses",
-    "nan": r"Faulty moves agent \d+ of scenario \w+ to x nan m",
-    "far": r"Faulty moves agent \d+ of scenario \w+ to x 1e\+08 m",
+    "nan": r"Faulty moves agent \d+ of scenario \w+ in rollout 0 at step 0 to x nan m",
+    "far": r"Faulty moves agent \d+ of scenario \w+ in rollout 0 at step 0 to x 1e\+08 m",
     "nan probability": r"Faulty decides with probabilities that are NaN in scenario",
     "probability per axis": r"Faulty.decide gives a distribution whose log_prob is \[1, 1, \d+, 2\]",
 }

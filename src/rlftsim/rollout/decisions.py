@@ -123,7 +123,8 @@ def check_numbers(
         row, rollout, agent, step = is_lost.nonzero()[0].tolist()
         x, y = position[row, rollout, agent, step].tolist()
         raise DataError(
-            f"{name} moves agent {int(batch.object_id[row, agent])} of scenario {batch.scenarios[row].scenario_id} to "
-            f"x {x:.4g} m, y {y:.4g} m, heading {float(heading[row, rollout, agent, step]):.4g} rad: positions must be "
-            f"within {MAX_COORDINATE_M:g} m of the map's origin, and all values numbers."
+            f"{name} moves agent {int(batch.object_id[row, agent])} of scenario {batch.scenarios[row].scenario_id} in "
+            f"rollout {rollout} at step {step} to x {x:.4g} m, y {y:.4g} m, heading "
+            f"{float(heading[row, rollout, agent, step]):.4g} rad: positions must be within {MAX_COORDINATE_M:g} m of "
+            "the map's origin, and all values numbers."
         )
