@@ -1,5 +1,7 @@
 """Long rollouts held against the log of the same world, by windows of 10 s."""
 
+import csv
+
 import numpy as np
 import pytest
 
@@ -50,7 +52,18 @@ def test_who_drives_as_the_log_has_ratios_of_one(long_road, tmp_path):
     for row in result.rows()[2:]:
         assert all("(1.00)" in row[column] for column in (2, 3, 4, 7))
         assert row[5] == "0.00"
-    assert (tmp_path / "constant_velocity.csv").read_text().count("\n") == 5
+    path = tmp_path / "constant_velocity.csv"
+    with path.open() as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["world"], line["start_s"]) for line in lines] == [(row[0], row[1][:-3]) for row in result.rows()]
+    assert float(lines[2]["speed_mps"]) == pytest.approx(float(lines[0]["speed_mps"])) == pytest.approx(5.0)
+    before = path.read_text()
+    rs.evaluate("constant_velocity", [long_road], num_rollouts=2, rollouts_per_pass=1, seconds=20.0, out=tmp_path)
+    assert path.read_text() == before
+    with pytest.raises(ConfigError, match=r"is the result of another rollouts, seed: name another --name"):
+        rs.evaluate("constant_velocity", [long_road], num_rollouts=1, seed=1, seconds=20.0, out=tmp_path)
+    with pytest.raises(ConfigError, match="an evaluation's name becomes a file name"):
+        rs.evaluate("constant_velocity", [long_road], name="../up", seconds=20.0, out=tmp_path)
 
 
 def test_what_cannot_be_held_against_the_log_is_refused_in_one_line(long_road, tmp_path, capsys):

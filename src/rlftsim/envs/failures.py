@@ -9,9 +9,9 @@ the same dice and the planner's stored motion, which gives equal bits; the plann
 import copy
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -222,9 +222,15 @@ class FailureChain:
             # 2. the steps
             action = np.zeros((size, *self.source.controls.limits.shape))
             for step in range(0, self.block_steps, episode.controls.steps):
+                acting: list[Any] = [planners[row] for row in acts]
+                is_joint = bool(acting) and acts_together(acting[0])
+                seen = None if is_joint or not acting else look(episode, state)
                 with guard_planner(self.planner, self.scenario_id, lambda now=begin + step: now):
-                    for row, acted in zip(acts, _act(planners, acts, episode, state)):
-                        action[row] = acted
+                    if seen is not None:
+                        for row, planner in zip(acts, acting):
+                            action[row] = planner.act(seen.of_agent(int(row)))
+                    elif is_joint:
+                        action[acts] = act_together(acting, partial(_observe, episode, state, acts))
                 forced = imposed[:, step : step + episode.controls.steps]
                 state, _ = advance(episode, state, action, forced)
                 if observe is not None:
@@ -326,17 +332,9 @@ def _build_episode(source: Source, scenario_id: str, size: int) -> Episode:
     return source.episode([source.scenario(scenario_id)] * size)
 
 
-def _act(
-    planners: Sequence[Planner], rows: Int64[np.ndarray, "m"], episode: Episode, state: EpisodeState
-) -> Iterable[Any]:
-    """Actions in some rows, at once where the planners can."""
-    if not len(rows):
-        return ()
-    acting = [planners[row] for row in rows]
-    if acts_together(acting[0]):
-        return act_together(acting, lambda: {name: a[rows] for name, a in look(episode, state).by_name().items()})
-    seen = look(episode, state)
-    return [planner.act(seen.of_agent(int(row))) for planner, row in zip(acting, rows)]
+def _observe(episode: Episode, state: EpisodeState, rows: Int64[np.ndarray, "m"]) -> dict[str, np.ndarray]:
+    """Observations of the agents in some rows, by name."""
+    return {name: values[rows] for name, values in look(episode, state).by_name().items()}
 
 
 def copy_planner(planner: Planner) -> Planner:

@@ -481,7 +481,9 @@ def _decide(world: World, state: WorldState) -> Block:
         shape, log_prob = (len(world.mask), 1, world.mask.shape[1]), distribution.log_prob(decision, world.sampling)
         check_log_prob(policy, log_prob, shape)
         poses = read_poses(policy, policy.advance(context, policy_state, decision, imposed), shape)
-        check_numbers(policy, world.batch, log_prob, poses[..., :2], poses[..., 2])
+        follows = torch.from_numpy(world.mask & (world.drivers == Driver.POLICY)).to(log_prob.device)[:, None]
+        log_prob = torch.where(follows, log_prob, 0.0)
+        check_numbers(policy, world.batch, log_prob, poses[..., :2], poses[..., 2], state.step)
     return Block(policy_state, context, decision, poses[:, 0].cpu().numpy().astype(np.float64), presences)
 
 

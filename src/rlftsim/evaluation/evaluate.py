@@ -147,7 +147,7 @@ def _evaluate_group(
             results.append(Skipped(scenario.scenario_id, str(error)))
         else:
             states = simulate_evaluated(policy, collate([scenario]), config)
-            if position == 0:  # a wrong unit or frame shows in any scenario
+            if position == 0 and not isinstance(policy, str):  # a wrong unit or frame shows in any scenario
                 warn_of_doubts(scenario, states, f"rollouts of {type(policy).__name__}")
             result = score(log, states, metric_by_name(config.metric))
             results.append(row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id)))

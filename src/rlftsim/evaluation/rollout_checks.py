@@ -17,7 +17,7 @@ from rlftsim.geometry import wrapped
 from rlftsim.jobs.progress import log
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.consistency import DRIVING_MPS, MAX_ASKEW_DEG, MIN_COSINE, MIN_STEPS, TYPES_WITH_FRONT
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, STEP_S, TOTAL_STEPS, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, Scenario
 
 MAX_DISTANCE_M = 480.0
 """From the current position, 60 m/s for 8 seconds."""
@@ -84,12 +84,12 @@ class PoseChecks:
         self.has_front = np.isin(tracks.object_type[rows], TYPES_WITH_FRONT)  # [A]
         self.is_judged = np.ones((len(rows), poses.shape[-1]), bool)  # [A, T]
         if only_logged and scenario.has_future:
-            self.is_judged = tracks.valid[rows, HISTORY_STEPS:TOTAL_STEPS]
+            self.is_judged = tracks.valid[rows, TOTAL_STEPS - poses.shape[-1] : TOTAL_STEPS]
 
     @np.errstate(over="ignore")  # infinitely far is far
     def first_step_errors(self) -> Float32[np.ndarray, "N A"]:
         """Meters from each agent's first position to that of constant velocity, or to the current one if nearer."""
-        first, start = self.poses[:, :, :2, 0], self.position[:, :2]
+        first, start = self.poses[:, :, :2, 0], self.position[..., :2]
         moved, expected = first - start, np.float32(STEP_S) * self.velocity
         error = np.sqrt(np.minimum(*(np.square(v).sum(-1) for v in (moved, moved - expected))))  # [N, A]
         return error * self.is_judged[:, 0]

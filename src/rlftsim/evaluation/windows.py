@@ -3,18 +3,28 @@
 A agents, S steps of 0.1 s after the current one, K vehicles that follow another.
 """
 
-from collections.abc import Iterator, Sequence
+import csv
+import hashlib
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.in_memory import simulate_in_memory
+from rlftsim.evaluation.resumable import check_same_work
 from rlftsim.jobs.files import write_text
+from rlftsim.jobs.folder import check_name
 from rlftsim.jobs.progress import progress_bar
+from rlftsim.rollout.entries import identify_entries, load_entries
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, get_device
+from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import (
@@ -25,6 +35,7 @@ from rlftsim.scenario.types import (
     Scenario,
     Scenarios,
     count_steps,
+    list_scenario_ids,
 )
 from rlftsim.viewer.scene import compute_overlap
 
@@ -110,37 +121,70 @@ class WindowSamples:
     """In each world."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class WindowEvaluation:
     """Rollouts and logs of the same worlds, by windows of 10 s."""
 
     name: str
     windows: tuple[WindowSamples, ...]
     log: tuple[WindowSamples, ...]
+    identity: Mapping[str, object]
+    """What the rollouts are of: policy, worlds and settings."""
 
-    def write(self, path: Path) -> None:
-        """Write the table as CSV, whole or not at all."""
-        write_text(path, "".join(f"{','.join(row)}\n" for row in (HEADINGS, *self.rows())))
-
-    def rows(self) -> list[list[str]]:
-        """Cells under `HEADINGS`: the log, then the rollouts with ratios to the log in parentheses."""
+    def values(self) -> list[dict[str, Any]]:
+        """Measures of each window: those of the log, then those of the rollouts."""
         return [
-            _describe_window(name, number, samples, log)
+            {"world": name, "start_s": 10 * number, "end_s": 10 * number + 10, **_summarize(samples, log)}
             for name, windows in (("log", self.log), (self.name, self.windows))
             for number, (samples, log) in enumerate(zip(windows, self.log))
         ]
 
+    def rows(self) -> list[list[str]]:
+        """Cells under `HEADINGS`, with ratios to the log in parentheses."""
+        values = self.values()
+        return [_format_values(row, values[index % len(self.log)]) for index, row in enumerate(values)]
 
-def _describe_window(name: str, number: int, samples: WindowSamples, log: WindowSamples) -> list[str]:
-    def compare(field: str) -> str:
-        value, truth = (np.mean(getattr(of, field)) if len(getattr(of, field)) else np.nan for of in (samples, log))
-        return f"{value:.1f}" if samples is log else f"{value:.1f} ({value / max(truth, 0.01):.2f})"
+    def write(self, path: Path) -> None:
+        """Write CSV, a line per window, whole or not at all."""
+        lines, text = [{**row, **self.identity} for row in self.values()], io.StringIO()
+        writer = csv.DictWriter(text, lines[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+        write_text(path, text.getvalue())
 
-    minutes = samples.agent_minutes.sum()
+
+def _check_path(path: Path, identity: Mapping[str, object]) -> None:
+    """Check that a file is not there with results of other work."""
+    if path.exists():
+        with path.open(encoding="utf-8", errors="replace", newline="") as file:
+            stored = next(csv.DictReader(file), {})
+        differences = [name for name, value in identity.items() if stored.get(name) != str(value)]
+        check_same_work(path, differences, "name another --name")
+
+
+def _summarize(samples: WindowSamples, log: WindowSamples) -> dict[str, float]:
+    """Means of a window, by column; NaN where there are no samples."""
+    means = {name: float(values.mean()) if len(values) else math.nan for name, values in vars(samples).items()}
+    minutes = float(samples.agent_minutes.sum())
+    return {
+        "agents_within_60_m": means["density"], "moving": means["driving"], "speed_mps": means["speed"],
+        "w1_speed_mps": compute_distance(samples.speed, log.speed), "w1_gap_m": compute_distance(samples.gap, log.gap),
+        "ego_speed_mps": means["ego_speed"], "entries_per_min": 6 * means["entries"],
+        "collisions_per_agent_min": float(samples.collisions.sum()) / minutes if minutes else math.nan,
+    }  # fmt: skip
+
+
+def _format_values(row: Mapping[str, Any], log: Mapping[str, Any]) -> list[str]:
+    """Cells of a row under `HEADINGS`."""
+
+    def compare(name: str) -> str:
+        value, truth = row[name], log[name]
+        return f"{value:.1f}" if row is log or not truth > 0 else f"{value:.1f} ({value / truth:.2f})"
+
     return [
-        name, f"{10 * number}-{10 * number + 10}", compare("density"), compare("driving"), compare("speed"),
-        f"{compute_distance(samples.speed, log.speed):.2f}", f"{compute_distance(samples.gap, log.gap):.1f}",
-        compare("ego_speed"), f"{samples.collisions.sum() / minutes:.2f}", f"{6 * samples.entries.mean():.0f}",
+        row["world"], f"{row['start_s']}-{row['end_s']}", *map(compare, ("agents_within_60_m", "moving", "speed_mps")),
+        f"{row['w1_speed_mps']:.2f}", f"{row['w1_gap_m']:.1f}", compare("ego_speed_mps"),
+        f"{row['collisions_per_agent_min']:.2f}", f"{row['entries_per_min']:.0f}",
     ]  # fmt: skip
 
 
@@ -154,8 +198,10 @@ def evaluate_windows(
     seed: int = 0,
     sampling: Sampling = Sampling(),  # noqa: B008
     entries: str | None = None,
+    rollouts_per_pass: int = 8,
+    out: Path | None = None,
 ) -> WindowEvaluation:
-    """Samples of the rollouts of a policy and of the logs of the same worlds.
+    """Samples of the rollouts of a policy and of the logs of the same worlds; written to OUT/NAME.csv.
 
     Args:
         policy: Policy in evaluation mode, which moves all agents.
@@ -166,11 +212,15 @@ def evaluate_windows(
         seed: Seed of the rollouts.
         sampling: Temperature and truncation of the decisions.
         entries: Name or file of the model of who enters; None = nobody enters or leaves.
+        rollouts_per_pass: Rollouts in memory at once.
+        out: Folder of the result; None = in memory alone.
 
     Raises:
-        ConfigError: A length that is no multiple of 10 s, or entries that do not fit the policy.
+        ConfigError: A length that is no multiple of 10 s, entries that do not fit the policy, or a file of that name
+            with the result of other work.
         DataError: No scenario, or a log that ends before the rollouts.
     """
+    check_name(name, "an evaluation's name")
     num_steps = count_steps(seconds)
     if num_steps % WINDOW_STEPS:
         raise ConfigError(f"seconds={seconds:g}: windows last 10 s: take a multiple, or leave it out for the 8 s.")
@@ -181,22 +231,43 @@ def evaluate_windows(
                 f"scenario {scenario.scenario_id}: its log goes on for {left * STEP_S:.1f} s, too short to hold "
                 f"{seconds:g} s against: rlftsim synthesize --seconds {seconds + 10:g} makes longer ones."
             )
-    logs, rollouts = [], []
+    logs, rollouts, scenario_ids = [], [], list(list_scenario_ids(scenarios))
+    entry_model = None if entries is None else load_entries(entries)
+    identity = {
+        "policy": fingerprint_policy(policy), "worlds": hashlib.sha256("".join(scenario_ids).encode()).hexdigest()[:16],
+        "rollouts": num_rollouts, "seed": seed, "temperature": sampling.temperature, "top_k": sampling.top_k or "",
+        "entries": "" if entries is None else identify_entries(entries),
+    }  # fmt: skip
+    path = None if out is None else out / f"{name}.csv"
+    if path is not None:
+        _check_path(path, identity)
     with progress_bar(f"evaluate {name}", len(scenarios)) as advance:
         for position in range(len(scenarios)):
-            batch = collate([scenarios[position]]).to(get_device(policy))
-            simulated = simulate_in_memory(policy, batch, num_rollouts, seed, num_steps, sampling, None, entries)
-            assert simulated.provenance is not None
+            scenario = scenarios[position] if entry_model is None else add_visitors(scenarios[position])
+            batch = collate([scenario]).to(get_device(policy))
             logs.append(measure_windows(read_log(scenarios[position]).steps(slice(num_steps))))
-            rollouts += map(measure_windows, read_rollouts(simulated.provenance.scenarios[0], simulated))
+            for first in range(0, num_rollouts, rollouts_per_pass):
+                simulated = simulate(
+                    policy, batch, num_rollouts=range(first, min(first + rollouts_per_pass, num_rollouts)), seed=seed,
+                    num_steps=num_steps, sampling=sampling, entries=entry_model,
+                )  # fmt: skip
+                rollouts += map(measure_windows, read_rollouts(scenario, simulated))
             advance()
     if not logs:
         raise DataError("there are no scenarios to evaluate.")
-    return WindowEvaluation(name, *(tuple(map(join_samples, zip(*worlds))) for worlds in (rollouts, logs)))
+    windows, log = (tuple(map(join_samples, zip(*worlds))) for worlds in (rollouts, logs))
+    result = WindowEvaluation(name, windows, log, identity)
+    if path is not None:
+        result.write(path)
+    return result
 
 
 def measure_windows(motion: Motion) -> list[WindowSamples]:
-    """Samples of each 10 s of a world."""
+    """Samples of each 10 s of a world.
+
+    Args:
+        motion: Motion of all agents; what is left behind the last 10 s does not count.
+    """
     num_windows = motion.heading.shape[1] // WINDOW_STEPS
     return [_measure(motion.steps(slice(k * WINDOW_STEPS, (k + 1) * WINDOW_STEPS))) for k in range(num_windows)]
 
@@ -211,7 +282,12 @@ def join_samples(samples: Sequence[WindowSamples]) -> WindowSamples:
 
 
 def compute_distance(first: Float[np.ndarray, "k"], second: Float[np.ndarray, "m"]) -> float:
-    """Wasserstein distance of two samples, in their unit; NaN where one is empty."""
+    """Wasserstein distance of two samples, in their unit; NaN where one is empty.
+
+    Args:
+        first: Sample of any size.
+        second: Sample of another size, in the same unit.
+    """
     if not len(first) or not len(second):
         return float("nan")
     levels = np.linspace(0.005, 0.995, 199)
@@ -220,24 +296,24 @@ def compute_distance(first: Float[np.ndarray, "k"], second: Float[np.ndarray, "m
 
 def _measure(motion: Motion) -> WindowSamples:
     velocity = np.diff(motion.position, axis=1) / STEP_S
-    both = motion.valid[:, 1:] & motion.valid[:, :-1]
     sampled = slice(0, velocity.shape[1], STRIDE)
-    speed, both = np.linalg.norm(velocity, axis=-1)[:, sampled], both[:, sampled]
+    has_speed = (motion.valid[:, 1:] & motion.valid[:, :-1])[:, sampled]
+    speed = np.linalg.norm(velocity, axis=-1)[:, sampled]
     position, heading = motion.position[:, :-1][:, sampled], motion.heading[:, :-1][:, sampled]
     valid = motion.valid[:, :-1][:, sampled]
-    others = np.arange(len(valid)) != motion.ego
-    near = valid & (np.linalg.norm(position - position[motion.ego], axis=-1) < NEAR_M) & others[:, None]
-    moving = near & both & (speed > MOVING_MPS)
+    others, is_vehicle = np.arange(len(valid)) != motion.ego, motion.is_vehicle[:, None]
+    is_nearby = valid & (np.linalg.norm(position - position[motion.ego], axis=-1) < NEAR_M) & others[:, None]
+    is_moving = is_nearby & has_speed & (speed > MOVING_MPS)
     overlap = compute_overlap(
         position[None], heading[None], motion.size[:, 0], motion.size[:, 1], valid[None]
     )[0]  # fmt: skip
     begins = overlap[:, 1:] & ~overlap[:, :-1] & valid[:, :-1]
     appears = motion.valid[:, 1:] & ~motion.valid[:, :-1]
     return WindowSamples(
-        density=near.sum(0).astype(float),
-        driving=moving.sum(0).astype(float),
-        speed=speed[moving],
-        gap=_measure_gaps(position, heading, moving & motion.is_vehicle[:, None], valid & motion.is_vehicle[:, None]),
+        density=is_nearby.sum(0).astype(float),
+        driving=is_moving.sum(0).astype(float),
+        speed=speed[is_moving],
+        gap=_measure_gaps(position, heading, is_moving & is_vehicle, valid & is_vehicle),
         ego_speed=speed[motion.ego],
         collisions=np.array([float(begins.sum())]),
         entries=np.array([float(appears.sum())]),

@@ -148,7 +148,11 @@ class Recipe:
         return replace(self, **changed)
 
     def with_seed(self, seed: int) -> "Recipe":
-        """The same recipe, every stage of which (tokens, pre-training, fine-tuning) draws with this seed."""
+        """The same recipe, every stage of which (tokens, pre-training, fine-tuning) draws with this seed.
+
+        Args:
+            seed: Seed of all sections that have one, at least 0.
+        """
         sections = {name: getattr(self, name) for name in section_names(self)}
         drawn = {name: section for name, section in sections.items() if hasattr(section, "seed")}
         return replace(self, **{name: replace(section, seed=seed) for name, section in drawn.items()})

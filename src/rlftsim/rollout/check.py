@@ -10,6 +10,7 @@ where the rule applies.
 import copy
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -78,10 +79,11 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         cannot be simulated fails at that alone.
     """
     rules, name = Rules(_copy_for_evaluation(policy), tuple(scenarios), reference), type(policy).__name__
-    try:
-        _ = rules.rollouts
-    except DataError as error:  # which every rule would repeat
-        return CheckReport(name, (CheckResult("can be simulated", "failed", str(error)),))
+    with suppress(Exception):  # any other error is told by each rule
+        try:
+            _ = rules.rollouts
+        except DataError as error:  # which every rule would repeat
+            return CheckReport(name, (CheckResult("can be simulated", "failed", str(error)),))
     return check_rules(rules, name)
 
 

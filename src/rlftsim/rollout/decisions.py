@@ -98,6 +98,7 @@ def check_numbers(
     log_prob: Float[Tensor, "B N A *L"],
     position: Float[Tensor, "B N A t 2"],
     heading: Float[Tensor, "B N A t"],
+    first_step: int = 0,
 ) -> None:
     """Check that decisions have probabilities and lead somewhere: NaN would score like an agent that is not there.
 
@@ -107,24 +108,26 @@ def check_numbers(
         log_prob: Log-probabilities of the decisions.
         position: Positions that the decisions led to, map frame, meters.
         heading: Headings at these positions, rad.
+        first_step: Step of the first of these positions, for the message.
 
     Raises:
         DataError: A NaN, or a position more than `MAX_COORDINATE_M` from the origin; scenario and agent are named.
     """
-    name, is_nan = type(policy).__name__, log_prob.isnan().flatten(1).any(1)  # [B]
+    name, is_present = type(policy).__name__, batch.agent_mask[:, None]  # [B, 1, A]; padding may hold anything
+    is_nan = (log_prob.isnan().view(*log_prob.shape[:3], -1).any(-1) & is_present).flatten(1).any(1)  # [B]
     if is_nan.any():
         first = batch.scenarios[int(is_nan.nonzero()[0])].scenario_id
         raise DataError(
             f"{name} decides with probabilities that are NaN in scenario {first}: load its weights again if they "
             "diverged, or leave out a scenario with extreme values."
         )
-    is_lost = ~((position.abs() <= MAX_COORDINATE_M).all(-1) & heading.isfinite())  # [B, N, A, t]
+    is_lost = ~((position.abs() <= MAX_COORDINATE_M).all(-1) & heading.isfinite()) & is_present[..., None]
     if is_lost.any():
         row, rollout, agent, step = is_lost.nonzero()[0].tolist()
         x, y = position[row, rollout, agent, step].tolist()
         raise DataError(
             f"{name} moves agent {int(batch.object_id[row, agent])} of scenario {batch.scenarios[row].scenario_id} in "
-            f"rollout {rollout} at step {step} to x {x:.4g} m, y {y:.4g} m, heading "
+            f"rollout {rollout} at step {first_step + step} to x {x:.4g} m, y {y:.4g} m, heading "
             f"{float(heading[row, rollout, agent, step]):.4g} rad: positions must be within {MAX_COORDINATE_M:g} m of "
             "the map's origin, and all values numbers."
         )

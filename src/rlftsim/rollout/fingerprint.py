@@ -2,10 +2,10 @@
 
 import hashlib
 import inspect
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,7 +20,8 @@ def fingerprint_policy(policy: object) -> str:
     Moving code must leave the fingerprints of stored models valid. So a class is hashed under the declared name,
     `fingerprint_name` or else `architecture`, and without either under module and name. Classes of nested settings
     count too. A base class's name does not stand for a subclass, which is different code. Of a policy of another
-    package without a `fingerprint_name` the file counts that defines it, as an edit may make it decide otherwise.
+    package without a `fingerprint_name` the file counts that defines it, as an edit may make it decide otherwise; in a
+    notebook there is none.
 
     Args:
         policy: Policy of any class; the bytes of weights count, whatever the device.
@@ -30,10 +31,11 @@ def fingerprint_policy(policy: object) -> str:
     """
     digest = hashlib.blake2b(digest_size=16)
     _feed(digest, policy)
-    cls = type(policy)
-    if not is_ours(cls) and "fingerprint_name" not in vars(cls):
-        with suppress(TypeError, OSError):  # in a notebook there is no file
-            digest.update(Path(inspect.getfile(cls)).read_bytes())
+    for part in (policy, *(getattr(policy, name) for name in getattr(type(policy), "fingerprint_parts", ()))):
+        cls = type(part)
+        if not is_ours(cls) and "fingerprint_name" not in vars(cls):
+            with suppress(TypeError, OSError, KeyError):  # in a notebook there is no file
+                digest.update(inspect.getsource(sys.modules[cls.__module__]).encode())
     return digest.hexdigest()
 
 

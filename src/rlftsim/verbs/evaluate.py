@@ -28,7 +28,7 @@ from rlftsim.verbs.inputs import (
     with_checked_arguments,
 )
 
-BY_METRIC = ("metric", "goals", "jobs", "guidance_scale", "rollouts_per_pass", "work")
+BY_METRIC = ("metric", "goals", "jobs", "guidance_scale", "work")
 """Arguments without effect on rollouts of another length, which are held against the log by windows."""
 
 
@@ -130,13 +130,11 @@ def evaluate(
     if seconds is not None:
         if isinstance(model, str):
             raise ConfigError("the oracle has no long rollouts: the log is in every table, name a model.")
-        result = evaluate_windows(
+        return evaluate_windows(
             frozen_copy(model), to_scenarios(data, split, limit), seconds=seconds, name=name,
             num_rollouts=num_rollouts, seed=seed, sampling=sampling, entries=entries,
+            rollouts_per_pass=rollouts_per_pass, out=None if out is None else Path(out),
         )  # fmt: skip
-        if out is not None:
-            result.write(Path(out) / f"{name}.csv")
-        return result
     # 3. Scores.
     runner = work.runner(jobs, work.on_error)
     source = dataset_folder(data) if isinstance(data, str | os.PathLike) else to_scenarios(data)
