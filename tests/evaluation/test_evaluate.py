@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+import rlftsim as rs
 import scenes
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as module
@@ -416,3 +417,22 @@ def test_file_metadata_is_readable_without_us(data, tmp_path):
     about = json.loads(pq.read_schema(tmp_path / "oracle.parquet").metadata[b"rlftsim"])
     assert about["provenance"]["policy"] == "oracle"
     assert about["provenance"]["config"]["num_rollouts"] == 4
+
+
+def test_generated_scenes_and_the_oracle_are_evaluated_without_a_warning(capsys):
+    generated = rs.evaluate("constant_velocity", "synthetic", metric="2025-scenario-gen", limit=1, num_rollouts=2)
+    assert 0 < generated["meta_metric"][0] < 1
+    oracle = rs.evaluate("oracle", "synthetic", limit=1, num_rollouts=2)
+    assert oracle["min_average_displacement_error"][0] == 0
+    assert "rollouts of" not in capsys.readouterr().err
+
+
+def test_degrees_are_told_where_a_model_is_evaluated(data, capsys):
+    class Degrees(ConstantVelocity):
+        def advance(self, context, state, decision, forced=None):
+            after = super().advance(context, state, decision, forced)
+            after.poses[..., 2] = torch.rad2deg(after.poses[..., 2]) + 170
+            return after
+
+    evaluate(Degrees(), data, None, replace(CONFIG, limit=1), name="degrees")
+    assert "rad (degrees?)" in capsys.readouterr().err
