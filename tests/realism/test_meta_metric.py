@@ -206,7 +206,7 @@ def test_states_of_another_shape_or_precision_are_refused(scenario):
     # Where run-time type checks are on, they refuse first: another message, the same refusal.
     refusals = (DataError, jaxtyping.TypeCheckError)
     states = draw_rollouts(scenario, 2, seed=1)
-    with pytest.raises(refusals, match=r"float32 of shape \[N, A = 5, T = 80\], got torch.float64"):
+    with pytest.raises(refusals, match=r"float32 tensor \[N, A = 5, T = 80\], got a Tensor of torch.float64"):
         dataclasses.replace(states, x=states.x.double())
     with pytest.raises(refusals, match=r"\[2, ?5, ?79\]"):
         dataclasses.replace(states, z=states.z[..., 1:])

@@ -85,7 +85,7 @@ def check_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
         if not isinstance(argument, Rollouts) or isinstance(scenarios, Rollouts):
             types = ", ".join(type(value).__name__ for value in (scenarios, *rollouts))
             raise ConfigError(
-                f"write rs.{function}(scenario, rollouts) with rollouts of rs.simulate, got ({types}): arrays of "
+                f"write rs.{function}(scenario, rollouts), got ({types}): rollouts are those of rs.simulate, arrays of "
                 "another simulator go through files, see docs/rollout_formats.md."
             )
         poses = (argument.position, argument.heading)
