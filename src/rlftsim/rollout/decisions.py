@@ -114,7 +114,8 @@ def check_numbers(
         DataError: A NaN, or a position more than `MAX_COORDINATE_M` from the origin; scenario and agent are named.
     """
     name, is_present = type(policy).__name__, batch.agent_mask[:, None]  # [B, 1, A]; padding may hold anything
-    is_nan = (log_prob.isnan().view(*log_prob.shape[:3], -1).any(-1) & is_present).flatten(1).any(1)  # [B]
+    is_nan = log_prob.isnan() if log_prob.dim() == 3 else log_prob.isnan().any(-1)  # [B, N, A]
+    is_nan = (is_nan & is_present).flatten(1).any(1)  # [B]
     if is_nan.any():
         first = batch.scenarios[int(is_nan.nonzero()[0])].scenario_id
         raise DataError(
