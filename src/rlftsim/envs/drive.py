@@ -59,7 +59,10 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     }  # fmt: skip
     drive_settings = [
         DriveSettings(
-            traffic=traffic, model=env.source.fingerprint, entries=_identify_entries(config, traffic), **common_settings
+            traffic=traffic,
+            model=env.source.fingerprint,
+            entries=identify_entries(env.config.entries),
+            **common_settings,
         )
         for traffic, env in zip(config.traffic, environments)
     ]
@@ -71,11 +74,6 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         for settings, path in zip(drive_settings, paths):
             _read_and_refuse(config, settings, ids, path)
         return [_drive_traffic(config, settings, ids, path) for settings, path in zip(drive_settings, paths)]
-
-
-def _identify_entries(config: DriveConfig, traffic: str) -> str | None:
-    entries = config.find_entries(traffic)
-    return None if entries is None else identify_entries(entries)
 
 
 def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult | None:

@@ -79,13 +79,9 @@ class DriveConfig:
         """Settings of the environment for a type of traffic: no event ends an episode, and no reward is given."""
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic), stop_on=(),
-            entries=self.find_entries(traffic), reward="none", max_steps=count_steps(self.seconds),
+            entries=self.entries if traffic == "policy" else None, reward="none", max_steps=count_steps(self.seconds),
             **read_action_settings(load_planner(self.planner)),
         )  # fmt: skip
-
-    def find_entries(self, traffic: str) -> str | None:
-        """Model of who enters a type of traffic; None = nobody."""
-        return self.entries if traffic == "policy" else None
 
     def count_side_by_side(self, traffic: str, num_scenarios: int) -> int:
         """Number of scenarios that are driven at once, such that every process has some.

@@ -163,6 +163,5 @@ def _parse_dice(rows: list[Any], num_steps: int, episode: Episode) -> list[tuple
 def _settings(episode: Episode) -> dict[str, Any]:
     """Settings that an episode depends on, as JSON has them."""
     settings = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
-    if settings["entries"] is not None:
-        settings["entries"] = identify_entries(settings["entries"])
+    settings["entries"] = identify_entries(settings["entries"])
     return parse_json(json.dumps(settings), "give plain values", source="settings of the environment")

@@ -23,12 +23,11 @@ from rlftsim.jobs.documents import check_has_end
 from rlftsim.jobs.files import describe_type
 from rlftsim.realism import SimulatedStates
 from rlftsim.realism.agents import check_closed
+from rlftsim.rollout.decisions import MAX_COORDINATE_M
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
 
 FORMATS_NOTE = "see docs/rollout_formats.md"
 AXES = ("x", "y", "z", "heading")
-MAX_COORDINATE_M = 1e6
-"""Beyond, float32 positions are coarser than 6 cm: such coordinates are of another frame, or damaged."""
 MAX_ID_LENGTH = 200
 """Characters of a scenario's id, which names files."""
 _KEYS = ("scenario_id", "object_ids", *AXES)

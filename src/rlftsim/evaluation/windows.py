@@ -239,7 +239,7 @@ def evaluate_windows(
     identity = {
         "policy": fingerprint_policy(policy), "worlds": hashlib.sha256("".join(scenario_ids).encode()).hexdigest()[:16],
         "rollouts": num_rollouts, "seed": seed, "temperature": sampling.temperature, "top_k": sampling.top_k or "",
-        "entries": "" if entries is None else identify_entries(entries),
+        "entries": identify_entries(entries) or "",
     }  # fmt: skip
     path = None if out is None else out / f"{name}.csv"
     if path is not None:

@@ -21,7 +21,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS
 
 MAX_COORDINATE_M = 1e6
-"""Farther from the origin of the map frame no agent is."""
+"""Beyond, float32 positions are coarser than 6 cm: such coordinates are of another frame, or damaged."""
 
 RELIT_STEPS = 20
 """After the metric's 8 s agents see the lights of the log, anew every 2 s; within these they see those of "now"."""

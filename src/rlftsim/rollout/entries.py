@@ -235,8 +235,10 @@ def load_entries(name: str) -> EntryModel:
     return model
 
 
-def identify_entries(name: str) -> str:
-    """Text that is equal for the same entry model: the name, or a hash of the file."""
+def identify_entries(name: str | None) -> str | None:
+    """Text that is equal for the same entry model: the name, or a hash of the file; None where nobody enters."""
+    if name is None:
+        return None
     return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16] if name.endswith(".npz") else name
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.threads import one_thread
-from rlftsim.rollout.decisions import check_log_prob, check_numbers, encode_lights, read_poses
+from rlftsim.rollout.decisions import check_log_prob, check_numbers, encode_lights, inference, read_poses
 from rlftsim.rollout.entries import EntryModel
 from rlftsim.rollout.noise import draw_noise, name_decisions
 from rlftsim.rollout.open_world import OpenRollouts
@@ -26,8 +25,7 @@ Force = Callable[[Any, int], AgentStates | None]
 Observe = Callable[[Float[Tensor, "B N A t 3"]], None]
 
 
-@one_thread()
-@torch.no_grad()
+@inference()
 def simulate(
     policy: Policy,
     batch: ScenarioBatch,
