@@ -62,6 +62,7 @@ class Comparison:
     """Size of the comparison with brute force, for each planner."""
 
     planners: tuple[str, ...] = PLANNERS
+    data: str = "synthetic"
     scenarios: int = 5
     look: int = 300
     """Episodes of each scenario that choose."""
@@ -76,7 +77,7 @@ def compare_with_brute_force(out: Path, size: Comparison) -> None:
     particles, repeats = size.particles, size.repeats
     rows, overlaps = [], 0
     for planner in size.planners:
-        config, chosen = StudyConfig(planner, particles=particles), []
+        config, chosen = StudyConfig(planner, size.data, particles=particles), []
         for scenario_id in config.scenario_ids():
             # the first look decides which scenarios are driven further, and is not part of the comparison
             events, _ = count_events(config, scenario_id, look, out / "look")
@@ -86,7 +87,7 @@ def compare_with_brute_force(out: Path, size: Comparison) -> None:
                 break
         for scenario_id in chosen:
             events, brute_steps = count_events(
-                StudyConfig(planner, particles=particles, seed=1), scenario_id, episodes, out / "brute"
+                StudyConfig(planner, size.data, particles=particles, seed=1), scenario_id, episodes, out / "brute"
             )
             rate = events / episodes
             low = stats.beta.ppf(0.025, events, episodes - events + 1) if events else 0.0
@@ -146,15 +147,15 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--quick", action="store_true")
     sizes = parser.add_argument_group("size of `brute`")
-    for field in fields(Comparison)[1:]:
+    for field in fields(Comparison)[2:]:
         sizes.add_argument(f"--{field.name}", type=int, default=field.default)
     arguments = parser.parse_args()
     if arguments.part == "brute":
-        numbers = {field.name: getattr(arguments, field.name) for field in fields(Comparison)[1:]}
+        numbers = {field.name: getattr(arguments, field.name) for field in fields(Comparison)[2:]}
         numbers = (
             {"scenarios": 1, "look": 100, "episodes": 200, "particles": 8, "repeats": 3} if arguments.quick else numbers
         )
-        compare_with_brute_force(arguments.out, Comparison(tuple(arguments.planners), **numbers))
+        compare_with_brute_force(arguments.out, Comparison(tuple(arguments.planners), arguments.data[0], **numbers))
     else:
         budget, limit = ("60s", 2) if arguments.quick else (arguments.budget, arguments.limit)
         measure_tuning(arguments.out, arguments.planners, arguments.data, budget, arguments.jobs, limit)

@@ -186,8 +186,26 @@ def test_a_collision_is_a_danger_that_grows_until_it_happens(model, tmp_path):
     danger = found.chain.run(np.array([failure.dice]))[0][0].danger
     assert (danger[: failure.step] < 0).all()
     assert danger[failure.step] == 0
-    assert (np.diff(danger[failure.step - 15 : failure.step]) >= 0).all()
+    ends = danger[: failure.step : found.chain.block_steps][-3:]  # between them only the contact itself is measured
+    assert np.isfinite(ends).all()
+    assert (np.diff(ends) >= 0).all()
     assert [path.name for path in found.films(tmp_path / "crash.webp", limit=2)] == ["crash.webp", "crash-2.webp"]
+
+
+def test_what_is_not_measured_between_branching_points_changes_no_estimate(model):
+    class EveryStep:
+        """The event without `has_happened`, so that its danger is asked for at each step."""
+
+        def danger(self, view):
+            return EVENTS["collision"].danger(view)
+
+    scenario = build_scenario("near", [Mover(speed_mps=9.3), Mover(x_m=30.0, y_m=1.0, heading_rad=0.1, speed_mps=4.0)])
+    found = [
+        estimate_failures("idm", scenario, event=event, particles=4, repeats=2, policy=model).repeats
+        for event in ("collision", EveryStep())
+    ]
+    assert found[0] == found[1]
+    assert any(repeat.num_levels for repeat in found[0])
 
 
 @pytest.mark.parametrize("event", ["off_road", "red_light", "hard_braking"])

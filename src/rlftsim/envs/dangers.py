@@ -111,7 +111,10 @@ class StepView:
 
 @runtime_checkable
 class Event(Protocol):
-    """Something that may happen to a planner's agent."""
+    """Something that may happen to a planner's agent.
+
+    One with a costly danger may have `has_happened(view) -> bool`, too: it is asked where only that counts.
+    """
 
     def danger(self, view: StepView) -> float:
         """How near it is at a step: at least 0 exactly where it has happened, at this step or before."""
@@ -125,11 +128,13 @@ class Contact:
     at_fault: bool
     """True = only contacts that are its fault count, see `contact.classify_collision`."""
 
+    def has_happened(self, view: StepView) -> bool:
+        """True from the contact on."""
+        return any(collision.at_fault or not self.at_fault for collision in view.collisions)
+
     def danger(self, view: StepView) -> float:
         """0 from the contact on; before, minus the least of `costs`."""
-        if any(collision.at_fault or not self.at_fault for collision in view.collisions):
-            return 0.0
-        return min(-float(self.costs(view).min(initial=np.inf)), NEARLY)
+        return 0.0 if self.has_happened(view) else min(-float(self.costs(view).min(initial=np.inf)), NEARLY)
 
     def costs(self, view: StepView) -> Float[np.ndarray, "K"]:
         """Standard deviations to a contact with each agent near, beyond those that make one sure."""
@@ -274,6 +279,20 @@ EVENTS: dict[str, Event] = {
     "red_light": RedLight(),
     "hard_braking": HardBraking(),
 }
+
+
+def measure_danger(event: Event, view: StepView, *, is_branching_point: bool) -> float:
+    """Danger at a step; between the steps at which branches begin, only whether the event has happened.
+
+    Args:
+        event: Event that is measured.
+        view: What it sees.
+        is_branching_point: True at the end of a block, where the danger itself decides.
+    """
+    has_happened = getattr(event, "has_happened", None)
+    if is_branching_point or has_happened is None:
+        return event.danger(view)
+    return 0.0 if has_happened(view) else NEVER
 
 
 def find_event(event: Any) -> Event:

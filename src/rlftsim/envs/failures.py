@@ -21,7 +21,7 @@ from jaxtyping import Float, Int64
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, CollisionType
-from rlftsim.envs.dangers import Event, StepView, find_event
+from rlftsim.envs.dangers import Event, StepView, find_event, measure_danger
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.planners.batch import act_together, acts_together
 from rlftsim.envs.planners.registry import Planner, PlannerFailure, guard_planner, read_action_settings, to_planner
@@ -35,7 +35,7 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 
 BLOCK_STEPS = 5
-BATCH = 16
+BATCH = 32
 """Episodes that run side by side at most."""
 
 
@@ -235,9 +235,11 @@ class FailureChain:
                 state, _ = advance(episode, state, action, forced)
                 if observe is not None:
                     observe(episode, state)
+                end = step + episode.controls.steps
                 for row in acts:
-                    now = slice(begin + step + 1, begin + step + 1 + episode.controls.steps)
-                    danger[row, now] = self.event.danger(StepView(episode, state, int(row)))
+                    danger[row, begin + step + 1 : begin + end + 1] = measure_danger(
+                        self.event, StepView(episode, state, int(row)), is_branching_point=end == self.block_steps
+                    )
         motion = np.stack([track[tuple(episode.world.actors.T)] for track in state.world.track[CURRENT_STEP + 1 :]], 1)
         paths = [
             DrivenPath(dice[row], motion[row], danger[row], tuple(copies[row]), state.collisions[row])
