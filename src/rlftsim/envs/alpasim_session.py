@@ -263,8 +263,7 @@ class Session:
                     last = self.ego_path.time_us[-1]
                     raise RequestError("INVALID_ARGUMENT", f"poses of {EGO} end at {last} us, before {query_us} us")
                 self._advance(query_us)
-            paths = self._collect_paths(query_us)
-        return [(name, path) for name, path in paths if path is not None]
+            return list(self._collect_paths(query_us))
 
     def _extend_ego_path(self, update: PosePath) -> None:
         """Append the poses of an update, which replace a plan; poses that the world has stepped by do not change."""
@@ -293,8 +292,8 @@ class Session:
         velocity = (current[:2] - previous[:2]) / STEP_S
         return np.concatenate([current[:2] - self.world.scenes[0].scenario.origin, wrapped(current[3:]), velocity])
 
-    def _collect_paths(self, query_us: int) -> Iterable[tuple[str, PosePath | None]]:
-        """PosePath of each object from the query on; None for an object without a pose then."""
+    def _collect_paths(self, query_us: int) -> Iterable[tuple[str, PosePath]]:
+        """PosePath of each object from the query on, but of those without a pose then."""
         is_logged = query_us <= self.handover_us
         simulated = None if is_logged else self._collect_poses(query_us)
         for logged in self.objects:
@@ -307,8 +306,6 @@ class Session:
             elif logged.is_static or logged.path.covers(query_us):
                 times = np.array([query_us])
                 yield logged.object_id, PosePath(times, logged.path.at(times))
-            else:
-                yield logged.object_id, None
 
     def _collect_poses(self, query_us: int) -> tuple[Int64[np.ndarray, "m"], Float[np.ndarray, "A m 4"]]:
         """Poses of all agents at the query and at the steps after it that are decided."""
