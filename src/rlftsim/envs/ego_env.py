@@ -6,9 +6,9 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
+from rlftsim.envs.episode import Episode, EpisodeState, advance, look
 from rlftsim.envs.record import build_record
-from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
+from rlftsim.envs.resets import EpisodeOrder, begin_episodes, build_config, describe_start, describe_step
 from rlftsim.envs.result import Result, build_animation, build_page, build_result
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
@@ -51,7 +51,7 @@ class EgoEnv(gymnasium.Env):
         self.action_space = action_space(self.source.controls)
         self.observation_space = observation_space(self.config.observation)
         self._begun: tuple[Episode, EpisodeState] | None = None
-        self._seed, self._count = 0, 0
+        self._order: EpisodeOrder | None = None
         self._camera: Camera | None = None
 
     @property
@@ -85,22 +85,19 @@ class EgoEnv(gymnasium.Env):
         Raises:
             ConfigError: an unknown option or scenario.
         """
-        if seed is None and self._begun is None:
-            seed = draw_seed()
-        super().reset(seed=seed)
-        if seed is not None:
-            self._seed, self._count = seed, 0
-        scenario_id, dice, goals = choose_scenario(self.np_random, self.source, options or {}, self._seed, self._count)
-        self._count += 1
-        scenario = self.source.scenario(scenario_id)
-        episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
+        if seed is not None or self._order is None:
+            self._order = EpisodeOrder.from_seed(seed)
+            super().reset(seed=self._order.seed)
+            self._order.random = self.np_random
+        episode, state = begin_episodes(self.source, [self._order], options or {})
         if episode.num_agents != 1:
+            scenario_id = episode.world.scenes[0].scenario.scenario_id
             raise ConfigError(
                 f"the planner drives {episode.num_agents} agents of scenario {scenario_id}, this environment has one: "
                 "take rlftsim.envs.parallel_env."
             )
-        self._begun = episode, start(episode, (dice,))
-        return self._look(), describe_start(episode, self.state, 0, self.source)
+        self._begun = episode, state
+        return self._look(), describe_start(episode, state, 0, self.source)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Carry out an action.
@@ -174,7 +171,7 @@ class EgoEnv(gymnasium.Env):
         """Take over a running episode; the next episodes follow from the same seed, with the next rollouts."""
         dice = state.world.dice[-1][0]
         super().reset(seed=dice.seed)
-        self._begun, self._seed, self._count = (episode, state), dice.seed, dice.rollout + 1
+        self._begun, self._order = (episode, state), EpisodeOrder(self.np_random, dice.seed, dice.rollout + 1)
 
     def _look(self) -> Any:
         return format_observation(look(self.episode, self.state), self.config.observation, 0)

@@ -6,14 +6,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.spaces import Space
-from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
 from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import Driver, assign_drivers
-from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import OPTIONS, build_config, choose_scenario, describe_start, describe_step, draw_seed
+from rlftsim.envs.episode import Episode, EpisodeState, advance, look
+from rlftsim.envs.resets import OPTIONS, EpisodeOrder, begin_episodes, build_config, describe_start, describe_step
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, format_observation, observation_space
@@ -72,9 +71,7 @@ class TrafficParallelEnv(ParallelEnv):
             raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
         self.source, self.render_mode = source, None
         self._spaces = observation_space(config.observation), action_space(source.controls)
-        self._seed = draw_seed()
-        self._random, _ = seeding.np_random(self._seed)
-        self._count = 0
+        self._order = EpisodeOrder.from_seed(None)
         self._begun: tuple[Episode, EpisodeState] | None = None
         self.agents: list[str] = []
         self._names: list[str] = []
@@ -111,17 +108,9 @@ class TrafficParallelEnv(ParallelEnv):
             ConfigError: an unknown scenario, or a scenario without a planner-driven agent.
         """
         if seed is not None:
-            self._random, _ = seeding.np_random(seed)
-            self._seed, self._count = seed, 0
+            self._order = EpisodeOrder.from_seed(seed)
         environment_options = {name: value for name, value in (options or {}).items() if name in OPTIONS}
-        scenario_id, dice, goals = choose_scenario(
-            self._random, self.source, environment_options, self._seed, self._count
-        )
-        self._count += 1
-        scenario = self.source.scenario(scenario_id)
-        episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
-        state = start(episode, (dice,))
-        self._begun = episode, state
+        self._begun = episode, state = begin_episodes(self.source, [self._order], environment_options)
         scene = episode.world.scenes[0]
         self._names = [str(scene.object_id[agent]) for _, agent in episode.world.actors]
         self.agents = list(self._names)

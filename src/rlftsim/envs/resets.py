@@ -1,12 +1,15 @@
 """Parts that all environments share: settings by name, the choice of a scenario, `info` of resets and steps."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium.utils import seeding
 from jaxtyping import Bool
 
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.episode import Episode, EpisodeState, Outcome
+from rlftsim.envs.episode import Episode, EpisodeState, Outcome, start
 from rlftsim.envs.result import build_result
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
@@ -29,33 +32,49 @@ def build_config(settings: dict[str, Any]) -> EnvConfig:
     return EnvConfig(**settings)
 
 
-def draw_seed() -> int:
-    """A random seed, which fits an array of int64 and gives the same episodes again."""
-    return int(np.random.default_rng().integers(2**31))
+@dataclass(eq=False)
+class EpisodeOrder:
+    """Order of the episodes since a seed."""
+
+    random: np.random.Generator
+    """Draws the scenarios, also where the options of a reset name one."""
+    seed: int
+    """Seed of the traffic."""
+    count: int = 0
+    """Number of episodes since the seed, which is the number of the next rollout."""
+
+    @classmethod
+    def from_seed(cls, seed: int | None) -> "EpisodeOrder":
+        """The order of a seed; None = of a random one, which fits an array of int64 and gives the same episodes."""
+        seed = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+        return cls(seeding.np_random(seed)[0], seed)
 
 
-def choose_scenario(
-    random: np.random.Generator, source: Source, options: dict[str, Any], seed: int, count: int
-) -> tuple[str, Dice, Any]:
-    """Scenario, dice and goals of a reset.
+def begin_episodes(
+    source: Source, orders: Sequence[EpisodeOrder], options: dict[str, Any]
+) -> tuple[Episode, EpisodeState]:
+    """Episode in the next scenario of each order, which step together, and its first state.
 
     Args:
-        random: Generator that draws the scenario, also where the options name one.
         source: Scenarios to choose from.
+        orders: Order of each scene; it goes on by an episode.
         options: Options of the reset by name; other names than `OPTIONS` are refused.
-        seed: Seed of the traffic, a whole number.
-        count: Number of episodes since the seed, which is the number of the rollout.
 
     Raises:
-        ConfigError: an option that there is not.
+        ConfigError: an option that there is not, or an unknown scenario.
     """
     unknown_options = [name for name in options if name not in OPTIONS]
     if unknown_options:
         raise ConfigError(f"reset has no option {unknown_options[0]!r}: known are {', '.join(OPTIONS)}.")
-    index = int(random.integers(len(source.scenario_ids)))
-    scenario_id = options.get("scenario", source.scenario_ids[index])
-    rollout = whole_number("rollout", options.get("rollout", count), 0)
-    return scenario_id, Dice(seed, rollout), options.get("goals")
+    scenarios, dice = [], []
+    for order in orders:
+        index = int(order.random.integers(len(source.scenario_ids)))
+        dice.append(Dice(order.seed, whole_number("rollout", options.get("rollout", order.count), 0)))
+        order.count += 1
+        scenarios.append(source.scenario(options.get("scenario", source.scenario_ids[index])))
+    goals = options.get("goals")
+    episode = source.episode(scenarios, {s.scenario_id: goals for s in scenarios} if goals else None)
+    return episode, start(episode, tuple(dice))
 
 
 def describe_start(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:

@@ -5,21 +5,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int64
 
 from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
+from rlftsim.envs.episode import Episode, EpisodeState, advance, look
 from rlftsim.envs.resets import (
+    EpisodeOrder,
+    begin_episodes,
     build_config,
-    choose_scenario,
     describe_start,
     describe_step,
     describe_steps,
-    draw_seed,
     pick_row,
 )
 from rlftsim.envs.source import Source
@@ -27,15 +26,6 @@ from rlftsim.envs.spaces import action_space, format_observation, observation_sp
 from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.open import AnyScenarios
-
-
-@dataclass(eq=False)
-class _Slot:
-    """A slot for an environment: random numbers, and episodes since the seed."""
-
-    random: np.random.Generator
-    seed: int
-    count: int = 0
 
 
 @dataclass(eq=False)
@@ -93,7 +83,7 @@ class EgoVectorEnv(VectorEnv):
         self.single_observation_space = observation_space(config.observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._slots: list[_Slot] = []
+        self._slots: list[EpisodeOrder] = []
         self._groups: list[_Group] = []
         self._over = np.zeros(num_envs, bool)
 
@@ -143,8 +133,7 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError(f"seed has {len(seeds)} numbers, it must be one number or {self.num_envs}.")
         for i, slot_seed in enumerate(seeds):
             if len(self._slots) <= i or slot_seed is not None:
-                new_seed = draw_seed() if slot_seed is None else slot_seed
-                self._slots[i : i + 1] = [_Slot(seeding.np_random(new_seed)[0], new_seed)]
+                self._slots[i : i + 1] = [EpisodeOrder.from_seed(slot_seed)]
         notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._reset(np.flatnonzero(mask), options, notes)
         return self._observe(), notes
@@ -252,17 +241,9 @@ class EgoVectorEnv(VectorEnv):
 
     def _reset(self, slots: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
         """Begin episodes of some slots, which form a group, and note the infos of each episode."""
-        picks = []
-        for i in slots:
-            slot = self._slots[i]
-            picks.append(choose_scenario(slot.random, self.source, options, slot.seed, slot.count))
-            slot.count += 1
-        scenarios = [self.source.scenario(scenario_id) for scenario_id, _, _ in picks]
-        goals = {scenario_id: scenario_goals for scenario_id, _, scenario_goals in picks if scenario_goals}
-        episode = self.source.episode(scenarios, goals or None)
-        if episode.num_agents != len(picks):
+        episode, state = begin_episodes(self.source, [self._slots[i] for i in slots], options)
+        if episode.num_agents != len(slots):
             raise ConfigError("the planner drives more than the egos: take rlftsim.envs.parallel_env.")
-        state = start(episode, tuple(dice for _, dice, _ in picks))
         # groups lose the slots that went on, and are dropped when they have none left
         groups = [
             replace(group, slots=np.where(np.isin(group.slots, slots), -1, group.slots)) for group in self._groups
