@@ -6,7 +6,7 @@ edges and center lines but no lane polygons, hence the suffix `_style`: "inside 
 """
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -43,9 +43,16 @@ AHEAD_RAD, CROSSING_RAD = np.radians(30.0), np.radians(45.0)
 OVER_SPEED_MPS = 2.23
 LANE_M = 2.0
 """Lanes farther than this from an agent say nothing about it."""
-ACCELERATION = (-4.05, 2.40)
-LATERAL, YAW_RATE, YAW_ACCELERATION, LONGITUDINAL_JERK, JERK = 4.89, 0.95, 1.93, 4.13, 8.37
-"""Bounds of comfort, m/s², rad/s, rad/s², m/s³, m/s³."""
+ACCELERATION, LATERAL, JERK = (-4.05, 2.40), 4.89, 8.37
+COMFORT = {
+    "longitudinal": ACCELERATION,
+    "lateral": (-LATERAL, LATERAL),
+    "yaw_rate": (-0.95, 0.95),
+    "yaw_acceleration": (-1.93, 1.93),
+    "longitudinal_jerk": (-4.13, 4.13),
+    "jerk": (-JERK, JERK),
+}
+"""Bounds of comfort, m/s², m/s², rad/s, rad/s², m/s³, m/s³."""
 SMOOTH_STEPS, SMOOTH_JERK_STEPS = 7, 15
 """Windows of the Savitzky-Golay filter. nuPlan takes 8 for acceleration, which newer versions of SciPy refuse."""
 PDMS_STEPS = 40
@@ -98,13 +105,14 @@ def score_planner(record: Record) -> PlannerScores:
     missing, steps, kinematics = missing_scores(record), _measure_steps(record), _kinematics(record)
     components = _score_components(record, steps, kinematics)
     early = record.first(PDMS_STEPS)
-    early_components = _score_components(early, steps.first(PDMS_STEPS), _kinematics(early))
+    early_steps = {name: values[: PDMS_STEPS + 1] for name, values in steps.items()}
+    early_components = _score_components(early, early_steps, _kinematics(early))
     multiplied = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
     nuplan = math.prod(components[name] for name in multiplied if math.isfinite(components[name]))
     # NAVSIM: a collision with a standing object costs half, and the driving direction has weight 0
     area = early_components["drivable_area"]
     pdms = early_components["no_at_fault_collision"] * (1.0 if math.isnan(area) else area)
-    jerk = kinematics.jerk
+    jerk = kinematics["jerk"]
     collisions, faults = record.collisions, [collision.at_fault for collision in record.collisions]
     route_length_m = float(record.route.progress(record.route.points[-1:])[0]) if len(record.route) else math.nan
     scores = PlannerScores(
@@ -115,8 +123,8 @@ def score_planner(record: Record) -> PlannerScores:
         at_fault_collision_rate=float(any(faults)),
         hit_rate=float(not all(faults)),
         red_light_rate=float(passes_red_light(record.scene, record.agent_motion[:, :2])),
-        least_ttc_s=float(steps.time_to_collision_s.min()),
-        off_road_m=max(0.0, float(steps.off_road_m.max())),
+        least_ttc_s=float(steps["time_to_collision_s"].min()),
+        off_road_m=max(0.0, float(steps["off_road_m"].max())),
         route_completion=_gained(record.route, record.agent_motion) / route_length_m if route_length_m else math.nan,
         speed_change_mps=max((collision.speed_change_mps for collision in collisions), default=0.0),
         mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
@@ -153,37 +161,28 @@ def missing_scores(record: Record) -> dict[str, str]:
     return reasons
 
 
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """Measures of each step, which several scores share."""
-
-    off_road_m: Float[np.ndarray, "T1"]
-    lane_angle: Float[np.ndarray, "T1"]
-    limit_mps: Float[np.ndarray, "T1"]
-    time_to_collision_s: Float[np.ndarray, "T1"]
-
-    def first(self, num_steps: int) -> "_Steps":
-        """Measures of the first steps alone."""
-        return _Steps(*(getattr(self, field.name)[: num_steps + 1] for field in fields(self)))
+Measures = dict[str, Float[np.ndarray, "_"]]
+"""Numbers of each step by name, which several scores share."""
 
 
-def _measure_steps(record: Record) -> _Steps:
+def _measure_steps(record: Record) -> Measures:
     angle, limit, junction = _lane_headings(record)
-    return _Steps(off_road(record), angle, limit, _compute_times_to_collision(record, junction))
+    time_s = _compute_times_to_collision(record, junction)
+    return {"off_road_m": off_road(record), "lane_angle": angle, "limit_mps": limit, "time_to_collision_s": time_s}
 
 
-def _score_components(record: Record, steps: _Steps, kinematics: "_Kinematics") -> dict[str, float]:
+def _score_components(record: Record, steps: Measures, kinematics: Measures) -> dict[str, float]:
     """The eight parts of the score."""
     missing = missing_scores(record)
     ratio = math.nan if "progress" in missing else _progress_ratio(record)
     components = {
         "no_at_fault_collision": _collision_score(record),
-        "drivable_area": float((steps.off_road_m < OUTSIDE_M).all()),
+        "drivable_area": float((steps["off_road_m"] < OUTSIDE_M).all()),
         "making_progress": math.nan if math.isnan(ratio) else float(ratio >= MAKING_PROGRESS),
-        "driving_direction": _direction_score(record, steps.lane_angle),
+        "driving_direction": _direction_score(record, steps["lane_angle"]),
         "progress": ratio,
-        "time_to_collision": float(steps.time_to_collision_s.min() >= TTC_LEAST_S),
-        "speed_limit": _speed_score(record, steps.limit_mps),
+        "time_to_collision": float(steps["time_to_collision_s"].min() >= TTC_LEAST_S),
+        "speed_limit": _speed_score(record, steps["limit_mps"]),
         "comfort": _comfort(kinematics),
     }
     return {name: math.nan if name in missing else value for name, value in components.items()}
@@ -263,10 +262,19 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
 
 def _direction_score(record: Record, angle: Float[np.ndarray, "T1"]) -> float:
     step = np.linalg.norm(np.diff(record.agent_motion[:, :2], axis=0), axis=1)
-    against = np.where(np.nan_to_num(angle[1:]) > np.pi / 2, step, 0.0)
-    window = min(WRONG_WAY_STEPS, len(against))
-    max_against = np.convolve(against, np.ones(window), "valid").max() if window else 0.0
+    max_against = measure_wrong_way(step, np.nan_to_num(angle[1:]) > np.pi / 2)
     return 1.0 if max_against < WRONG_WAY_M[0] else 0.5 if max_against < WRONG_WAY_M[1] else 0.0
+
+
+def measure_wrong_way(step_m: Float[np.ndarray, "T"], is_against: Bool[np.ndarray, "T"]) -> float:
+    """Most meters driven against the lane within a second.
+
+    Args:
+        step_m: Way of each step of 0.1 s.
+        is_against: True = the step goes against the lane.
+    """
+    window = np.ones(min(WRONG_WAY_STEPS, len(step_m)))
+    return float(np.convolve(np.where(is_against, step_m, 0.0), window, "valid").max()) if len(window) else 0.0
 
 
 def _speed_score(record: Record, limit: Float[np.ndarray, "T1"]) -> float:
@@ -316,22 +324,11 @@ def _compute_times_to_collision(record: Record, junction: Bool[np.ndarray, "T1"]
     return times
 
 
-@dataclass(frozen=True, eq=False)
-class _Kinematics:
-    """Smoothed derivatives over the steps."""
-
-    longitudinal: Float[np.ndarray, "t"]
-    lateral: Float[np.ndarray, "t"]
-    yaw_rate: Float[np.ndarray, "t"]
-    yaw_acceleration: Float[np.ndarray, "t"]
-    longitudinal_jerk: Float[np.ndarray, "t"]
-    jerk: Float[np.ndarray, "t"]
-
-
-def _kinematics(record: Record) -> _Kinematics:
+def _kinematics(record: Record) -> Measures:
+    """Smoothed derivatives by the names of `COMFORT`."""
     motion = record.agent_motion
     if len(motion) < 5:  # too short for any derivative
-        return _Kinematics(*[np.zeros(0)] * 6)
+        return dict.fromkeys(COMFORT, np.zeros(0))
     # odd windows that fit a short record
     short, long = (min(window, len(motion) - 1 + len(motion) % 2) for window in (SMOOTH_STEPS, SMOOTH_JERK_STEPS))
     cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
@@ -339,14 +336,14 @@ def _kinematics(record: Record) -> _Kinematics:
     longitudinal = acceleration[:, 0] * cos + acceleration[:, 1] * sin
     heading = np.unwrap(motion[:, 2])
     jerk = _smooth(acceleration, long, order=2, derivative=1)
-    return _Kinematics(
-        longitudinal=longitudinal,
-        lateral=acceleration[:, 1] * cos - acceleration[:, 0] * sin,
-        yaw_rate=_smooth(heading, long, order=2, derivative=1),
-        yaw_acceleration=_smooth(heading, long, order=3, derivative=2),
-        longitudinal_jerk=_smooth(longitudinal, long, order=2, derivative=1),
-        jerk=np.linalg.norm(jerk, axis=1),
-    )
+    return {
+        "longitudinal": longitudinal,
+        "lateral": acceleration[:, 1] * cos - acceleration[:, 0] * sin,
+        "yaw_rate": _smooth(heading, long, order=2, derivative=1),
+        "yaw_acceleration": _smooth(heading, long, order=3, derivative=2),
+        "longitudinal_jerk": _smooth(longitudinal, long, order=2, derivative=1),
+        "jerk": np.linalg.norm(jerk, axis=1),
+    }
 
 
 def _smooth(
@@ -364,14 +361,11 @@ def _build_filter(count: int, window: int, order: int, derivative: int) -> Float
     return np.asarray(savgol_filter(np.eye(count), window, order, deriv=derivative, delta=STEP_S, axis=0))
 
 
-def _comfort(motion: _Kinematics) -> float:
-    if not len(motion.jerk):
+def _comfort(kinematics: Measures) -> float:
+    if not len(kinematics["jerk"]):
         return math.nan
-    low, high = ACCELERATION
-    holds = bool((motion.longitudinal >= low).all() and (motion.longitudinal <= high).all())
-    values = motion.lateral, motion.yaw_rate, motion.yaw_acceleration, motion.longitudinal_jerk, motion.jerk
-    bounds = LATERAL, YAW_RATE, YAW_ACCELERATION, LONGITUDINAL_JERK, JERK
-    return float(holds and all((np.abs(value) <= bound).all() for value, bound in zip(values, bounds)))
+    is_inside = ((low <= kinematics[name]) & (kinematics[name] <= high) for name, (low, high) in COMFORT.items())
+    return float(all(inside.all() for inside in is_inside))
 
 
 @cached_on_scenario

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Int64, Shaped
 
 from rlftsim.envs.contact import Collision, lane_search
-from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS
+from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, measure_wrong_way
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
@@ -143,8 +143,7 @@ def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.
             bool(points) and bool((np.cos(search.heading[points] - direction) < 0).all())
             for points, direction in zip(lane_points, heading)
         ]
-        window = np.ones(min(WRONG_WAY_STEPS, len(against)))
-        is_against[agent] = np.convolve(np.where(against, step[agent], 0.0), window, "valid").max() >= WRONG_WAY_M[0]
+        is_against[agent] = measure_wrong_way(step[agent], np.array(against)) >= WRONG_WAY_M[0]
     return is_against
 
 
