@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.envs.contact import LaneSearch, lane_search
-from rlftsim.envs.route import compute_headings, find_route, sample_line
+from rlftsim.envs.route import compute_headings, find_route
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.envs.sumo_traffic import build_sumo_scene
 from rlftsim.geometry import wrapped
+from rlftsim.goals.lane_paths import sample_line
 from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
 

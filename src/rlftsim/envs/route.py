@@ -22,6 +22,7 @@ from rlftsim.goals.lane_paths import (
     lanes_for,
     own_lanes,
     paths_from,
+    sample_line,
 )
 from rlftsim.goals.proposals import CurrentAgent, propose_from_lanes
 from rlftsim.scenario.lane_graph import LaneGraph
@@ -237,18 +238,6 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
     owner = graph.owner[candidates[nearest]]
     limit = np.where(on_lane, graph.speed_limit_mps[owner], 0.0)
     return Route(points, heading, ground, limit, np.unique(owner[on_lane]), source)
-
-
-def sample_line(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
-    """Points along a polyline from the start on.
-
-    Args:
-        line: Points of the polyline, at least two, m.
-        spacing_m: Distance from point to point along the line, m.
-    """
-    lengths = arc_length(line)
-    at = np.arange(0.0, lengths[-1] + 1e-6, spacing_m)
-    return np.stack([np.interp(at, lengths, line[:, k]) for k in range(2)], axis=1)
 
 
 def compute_headings(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.geometry import wrapped
 from rlftsim.scenario.lane_graph import LaneGraph
+from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, MapFeatureType, ObjectType
 
 CRUISE_MPS = {
@@ -250,18 +251,14 @@ def _chains(lanes: Lanes, start: int, length_m: float) -> Iterator[tuple[int, ..
     """Sequences of lanes from a point on, depth first, each until long enough or at an end."""
     graph = lanes.graph
     first = int(graph.owner[start])
-    stack = [((first,), _measure_length(graph.lines[first][start - graph.first[first] :]))]
+    stack = [((first,), arc_length(graph.lines[first][start - graph.first[first] :])[-1])]
     while stack:
         chain, length = stack.pop()
         successors = [n for n in graph.successors[chain[-1]] if n not in chain and lanes.usable[n]]
         if length >= length_m or not successors:
             yield chain
             continue
-        stack += [((*chain, n), length + _measure_length(graph.lines[n])) for n in reversed(successors)]
-
-
-def _measure_length(line: Float[np.ndarray, "n 3"]) -> float:
-    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
+        stack += [((*chain, n), length + arc_length(graph.lines[n])[-1]) for n in reversed(successors)]
 
 
 def _follow_chain(
@@ -273,7 +270,7 @@ def _follow_chain(
     head = graph.lines[chain[0]][start - graph.first[chain[0]] :]
     lines = [head, *(graph.lines[n][1:] for n in chain[1:])]
     middle = np.concatenate(lines)  # [n, 3]
-    if _measure_length(middle) < 2 * SPACING_M:
+    if arc_length(middle)[-1] < 2 * SPACING_M:
         return None
     limits = np.repeat(lanes.speed_limit_mps[list(chain)], [len(line) for line in lines])
     middle, limits = (values[: int(length_m / SPACING_M) + 1] for values in _resample(middle, limits))
@@ -288,9 +285,20 @@ def _resample(
     points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]]:
     """A point every meter along a polyline, and the values there."""
-    distance = np.append(0.0, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).cumsum())
-    grid = np.arange(0.0, distance[-1] + 1e-6, SPACING_M)
-    return np.stack([np.interp(grid, distance, axis) for axis in points.T], -1), np.interp(grid, distance, values)
+    sampled = sample_line(np.column_stack([points, values]), SPACING_M)
+    return sampled[:, :3], sampled[:, 3]
+
+
+def sample_line(line: Float[np.ndarray, "n k"], spacing_m: float) -> Float[np.ndarray, "m k"]:
+    """Points along a polyline from the start on.
+
+    Args:
+        line: Points of the polyline, at least two, m; columns after x and y are interpolated.
+        spacing_m: Distance from point to point along the line in the plane, m.
+    """
+    lengths = arc_length(line)
+    at = np.arange(0.0, lengths[-1] + 1e-6, spacing_m)
+    return np.stack([np.interp(at, lengths, column) for column in line.T], axis=1)
 
 
 def change_length_m(speed_mps: float) -> float:

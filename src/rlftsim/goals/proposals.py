@@ -37,6 +37,7 @@ from rlftsim.goals.lane_paths import (
 )
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, STRAIGHT_RAD, Maneuver, classify_turn
+from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, MapFeatureType, ObjectType, Scenario, cached_on_scenario
 
 FORBIDDEN = (
@@ -355,7 +356,7 @@ def _find_lane_change(scenario: Scenario, track: int, path: Float[np.ndarray, "S
     if agent.object_type != ObjectType.VEHICLE:
         return None
     lanes = lanes_for(lane_graph(scenario), agent.object_type)
-    length_m = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()) + BEYOND_END_M
+    length_m = float(arc_length(path)[-1]) + BEYOND_END_M
     paths = own_paths(agent, lanes, length_m=length_m)
     if not paths or distance_to(paths, path[-1]) < LANE_CHANGE_OFFSET_M:
         return None

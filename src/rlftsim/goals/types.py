@@ -102,6 +102,15 @@ class Goals:
         """The goals of the selected rollouts."""
         return self._apply(lambda values: values[:, selected])
 
+    def select_scenario(self, row: int, num_agents: int) -> "Goals":
+        """The goals of the first agents of a scenario.
+
+        Args:
+            row: Index of the scenario on axis B.
+            num_agents: Number of agents that stay.
+        """
+        return self._apply(lambda values: values[row : row + 1, :, :num_agents])
+
     def repeat(self, num_rollouts: int) -> "Goals":
         """The goals of a single rollout expanded to N, without copies; goals of N rollouts unchanged.
 
