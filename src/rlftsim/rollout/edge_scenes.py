@@ -6,17 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from rlftsim.geometry import wrapped
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, MapFeatures, Scenario, Tracks
 
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
 """53.13 degrees: sine 4/5 and cosine 3/5 are short fractions, so rotated grid points stay exact in float32."""
 GRID_M = 5 / 4096
-_NO_LIGHTS = LightStates(
-    np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32)
-)
-_NO_MAP = MapFeatures(
-    np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32), np.zeros(1, np.int64), LaneTopology()
-)
+_NO_LIGHTS, _NO_MAP = LightStates.of([]), MapFeatures.of([])
 
 
 def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, float]) -> Scenario:

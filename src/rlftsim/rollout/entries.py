@@ -11,7 +11,6 @@ G gates, K entrants of logs.
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -21,9 +20,9 @@ from jaxtyping import Float, Int64
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.geometry import wrapped
 from rlftsim.jobs.arrays import read_npz
-from rlftsim.jobs.files import write_atomically
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, Gates, find_region_m
+from rlftsim.rollout.types import write_npz
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
 
 REACH_M = 15.0
@@ -174,11 +173,7 @@ class _LoggedEntries:
         self.velocity, self.heading, self.valid = tracks.velocity, tracks.heading, tracks.valid
         self.object_type = tracks.object_type.astype(np.int64)
         self.region_m = find_region_m(scenario)
-
-    @cached_property
-    def distance(self) -> Float[np.ndarray, "O S"]:
-        """Distance from the ego."""
-        return np.linalg.norm(self.position - self.position[self.ego], axis=-1)
+        self.distance = np.linalg.norm(self.position - self.position[self.ego], axis=-1)  # [O, S]
 
     def assign(self, gates: Gates, step: int) -> tuple[Int64[np.ndarray, "K"], Int64[np.ndarray, "K"]]:
         """Gate and track of each agent that is seen half a second later and was beyond the border or not seen."""
@@ -249,12 +244,7 @@ def write_entries(path: Path, model: FittedEntries) -> None:
         path: File that `load_entries` reads.
         model: Weights of the regression, and the entrants of the logs.
     """
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, weights=np.array(model.weights), **vars(model.entrants))
-
-    write_atomically(path, write)
+    write_npz(path, weights=np.array(model.weights), **vars(model.entrants))
 
 
 def _read_entries(path: str) -> FittedEntries:

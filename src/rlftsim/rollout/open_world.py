@@ -241,13 +241,10 @@ class OpenWorld:
             return lane, float(gates.heading[k]), False
         # a place to park may be on a lane of this road, then it is the side of the gate's lane
         for offset in (left, -ROADSIDE_M) if is_vehicle else ():
-            if not self._is_on_lane(lane + offset * side):
+            is_on_lane = np.linalg.norm(self.finder.points - (lane + offset * side), axis=-1) < OFF_LANES_M
+            if not is_on_lane.any():  # cars pass it
                 return lane + offset * side, float(gates.heading[k]) + turn, True
         return None if is_vehicle else (lane + left * side, float(gates.heading[k]) + turn, False)
-
-    def _is_on_lane(self, position: Float[np.ndarray, "2"]) -> bool:
-        """True where cars would not pass a parked one."""
-        return bool((np.linalg.norm(self.finder.points - position, axis=-1) < OFF_LANES_M).any())
 
 
 class OpenRollouts:

@@ -8,7 +8,6 @@ axes `*event` (none for SMART's token ids, one of size 2 for two-dimensional act
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -136,15 +135,9 @@ class Rollouts:
         if isinstance(selected, int | np.integer):
             single = f"slice({selected}, {selected + 1})" if selected != -1 else "slice(-1, None)"
             raise ConfigError(f"select takes a slice of the rollouts, got {selected}: write {single} for a single one.")
-        names = ("position", "heading", "decision", "decision_mask", "log_prob")
-        return replace(
-            self,
-            **{name: getattr(self, name)[:, selected] for name in names},
-            goals=None if self.goals is None else self.goals.rollouts(selected),
-            draws=None if self.draws is None else self.draws[:, selected],
-            forced=None if self.forced is None else self.forced.rollouts(selected),
-            valid=None if self.valid is None else self.valid[:, selected],
-        )
+        values = {name: values[:, selected] for name, values in self._collect_tensors().items()}
+        goals, forced = (states and states.rollouts(selected) for states in (self.goals, self.forced))
+        return replace(self, **values, goals=goals, forced=forced)
 
     def select_scenario(self, row: int, num_agents: int) -> "Rollouts":
         """Rollouts of a single scenario; without the steps that were forced.
@@ -153,16 +146,14 @@ class Rollouts:
             row: Index of the scenario on axis B.
             num_agents: Agents to keep, the first ones, such as all but padding.
         """
-        names = ("position", "heading", "decision", "decision_mask", "log_prob")
-        values = {name: getattr(self, name)[row : row + 1, :, :num_agents] for name in names}
-        goals = self.goals
-        if goals is not None:
-            position, mask = (tensor[row : row + 1, :, :num_agents] for tensor in (goals.position, goals.goal_mask))
-            goals = replace(goals, position=position, goal_mask=mask)
-        draws = None if self.draws is None else self.draws[row : row + 1]
-        if self.valid is not None:
-            values["valid"] = self.valid[row : row + 1, :, :num_agents]
-        return replace(self, **values, draws=draws, goals=goals, forced=None)
+        values = {name: values[row : row + 1] for name, values in self._collect_tensors().items()}
+        values |= {name: tensor[:, :, :num_agents] for name, tensor in values.items() if name != "draws"}
+        goals = self.goals and self.goals.select_scenario(row, num_agents)
+        return replace(self, **values, goals=goals, forced=None)
+
+    def _collect_tensors(self) -> dict[str, Tensor]:
+        """Fields that are tensors, by name; all have the axes of scenarios and rollouts."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
     # ---- agents by object id: rollouts that `rlftsim.simulate` returned ------------------------------------------
 
@@ -254,10 +245,20 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
         z = np.broadcast_to(heights[b, : len(indices), None], heading.shape)
         ids = {"scenario_id": np.array(scenario.scenario_id), "object_ids": scenario.tracks.object_id[indices]}
         presence = {} if rollouts.valid is None else {"valid": rollouts.valid[b, :, : len(indices)].cpu().numpy()}
-        write_atomically(file, partial(_write_npz, **ids, **presence, x=x, y=y, z=z, heading=heading))
+        write_npz(file, **ids, **presence, x=x, y=y, z=z, heading=heading)
     return files
 
 
-def _write_npz(path: Path, **arrays: np.ndarray) -> None:
-    with path.open("wb") as file:  # by name, numpy would append .npz
-        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType] (numpy's stub)
+def write_npz(path: Path, **arrays: np.ndarray) -> None:
+    """Write arrays by name to a packed npz, whole or not at all.
+
+    Args:
+        path: File to write, replaced if there is one.
+        arrays: Array of each name.
+    """
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # by name, numpy would append .npz
+            np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType] (numpy's stub)
+
+    write_atomically(path, write)
