@@ -100,12 +100,9 @@ def build_controls(
         ConfigError: No such action, or an action that the policy has no tokens for.
     """
     bicycle = Bicycle(reverse=reverse, max_braking=MAX_BRAKING_MPS2 if hard_braking else ACCELERATION_MPS2)
-    if action_type == "bicycle":
-        return bicycle
-    if action_type == "bicycle_discrete":
-        return DiscreteBicycle(bicycle)
-    if action_type == "pose":
-        return PoseControls()
+    simple = {"bicycle": bicycle, "bicycle_discrete": DiscreteBicycle(bicycle), "pose": PoseControls()}
+    if action_type in simple:
+        return simple[action_type]
     if action_type == "trajectory":
         if not MIN_HORIZON <= horizon <= MAX_HORIZON or tracker not in ("perfect", "bicycle"):
             raise ConfigError(
@@ -259,9 +256,7 @@ class TrajectoryControls(Controls):
         _check_vehicles(actors, "trajectory with the bicycle")
         # Steers for the point ahead; has the speed of the first pose, so that errors along do not remain.
         speed = signed_speed(actors.motion)
-        is_beyond_pursuit = np.linalg.norm(poses[..., :2], axis=-1) >= pursuit_m(speed)[:, None]  # [M, H]
-        target = np.where(is_beyond_pursuit.any(1), is_beyond_pursuit.argmax(1), poses.shape[1] - 1)
-        steering = pursue(poses[np.arange(len(poses)), target, :2], actors.size[:, 0])
+        steering = steer_along(poses[..., :2], speed, actors.size[:, 0])
         acceleration = (poses[:, 0, 0] / STEP_S - speed) / STEP_S
         lowest = -np.where(speed > 0, self.tracker.max_braking, ACCELERATION_MPS2)
         acceleration = np.clip(acceleration, lowest, ACCELERATION_MPS2)
@@ -324,6 +319,21 @@ def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:
     vx, vy = motion[..., 3], motion[..., 4]
     forward = vx * np.cos(motion[..., 2]) + vy * np.sin(motion[..., 2])
     return np.where(forward < 0, -1.0, 1.0) * np.hypot(vx, vy)
+
+
+def steer_along(
+    line: Float[np.ndarray, "M P 2"], speed: Float[np.ndarray, "M"], length: Float[np.ndarray, "M"]
+) -> Float[np.ndarray, "M"]:
+    """Steering angle of pure pursuit of lines, rad: of the first point that is far enough ahead, else of the last.
+
+    Args:
+        line: Points in each vehicle's own frame, m.
+        speed: Speed of the vehicles, m/s.
+        length: Length of the vehicles, m.
+    """
+    is_far = np.linalg.norm(line, axis=-1) >= pursuit_m(speed)[:, None]  # [M, P]
+    target = np.where(is_far.any(1), is_far.argmax(1), -1)
+    return pursue(line[np.arange(len(line)), target], length)
 
 
 def to_heading_frame(

@@ -15,11 +15,10 @@ from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimat
 from rlftsim.envs.failures import Failure, Repeat
 from rlftsim.envs.planners.registry import PlannerFailure
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.resumable import ScenarioValues
+from rlftsim.evaluation.resumable import ScenarioValues, run_groups
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
-from rlftsim.jobs.items import group_positions, group_task, run_items
 from rlftsim.jobs.processes import Task
 from rlftsim.jobs.runner import Joining, Runner, Share
 
@@ -103,9 +102,8 @@ def _measure(
     title: str, format: ScenarioValues[Any], work: Callable[[int], Mapping[str, object]], runner: Runner
 ) -> list[Any]:
     """Values of all items, from their files, which stay."""
-    groups = group_positions(len(format.scenario_ids), 1)
     with Lease(format.folder / ".lock", runner, "works in") as lease:
-        values = run_items(title, groups, group_task(work, format), format=format, lease=lease, runner=runner)
+        values = run_groups(title, format.scenario_ids, work, format, lease, runner)
         remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
         lease.remove()
     return values

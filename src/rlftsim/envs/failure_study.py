@@ -121,8 +121,8 @@ class StudyConfig:
 def load_source(config: StudyConfig) -> tuple[Planner, Source]:
     """Planner, and the source of its episodes; made once in each process."""
     planner = load_planner(config.planner)
-    settings: dict[str, Any] = {"model": config.model, "traffic": config.traffic}
-    return planner, make_source(planner, None, data=config.data, split=config.split, **settings)
+    settings = {name: getattr(config, name) for name in ("data", "split", "model", "traffic")}
+    return planner, make_source(planner, None, **settings)
 
 
 def parse_budget(text: str) -> int:

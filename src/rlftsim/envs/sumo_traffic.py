@@ -214,13 +214,7 @@ class SumoWorld:
         """Socket of a new episode, in which SUMO stands at the current step of a window."""
         if self.process is None:
             self.control, control_end = socket.socketpair()
-            command = [
-                sys.executable,
-                "-m",
-                "rlftsim.scenario.synthetic.rerun",
-                str(self.path),
-                str(control_end.fileno()),
-            ]
+            command = [sys.executable, "-m", WORKER, str(self.path), str(control_end.fileno())]
             self.process = subprocess.Popen(
                 command, pass_fds=[control_end.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD, ActionType, pursue, pursuit_m
+from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD, ActionType, steer_along
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration, find_leaders
 from rlftsim.envs.planners.batch import BatchPlanner, Observe
 from rlftsim.envs.planners.view import View, read_view
@@ -28,9 +28,7 @@ class IdmPlanner(BatchPlanner):
         free_speed = np.where(view.limit_mps > 0, view.limit_mps, self.config.speed_mps)
         speed = np.maximum(view.speed, 0.0)
         acceleration = compute_idm_acceleration(speed, free_speed, gap, lead, self.config)
-        is_far = np.linalg.norm(view.line, axis=-1) >= pursuit_m(speed)[:, None]  # [M, P]
-        target = np.where(is_far.any(1), is_far.argmax(1), -1)
-        steering = pursue(view.line[np.arange(len(target)), target], view.size[:, 0])
+        steering = steer_along(view.line, speed, view.size[:, 0])
         action = np.stack([acceleration / ACCELERATION_MPS2, steering / STEERING_RAD], -1)
         return np.clip(action, -1, 1).astype(np.float32)
 

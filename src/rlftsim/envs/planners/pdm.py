@@ -159,7 +159,8 @@ class _Meetings:
             step: Step of 0.1 s from the time of planning on, with the boxes at constant velocity.
             count: Number M of scenes.
         """
-        boxes = _coasted(self.boxes, step * STEP_S)
+        boxes = self.boxes.copy()
+        boxes[:, :2] += step * STEP_S * boxes[:, 3:]
         x, y = self.line_x - boxes[:, :1, None], self.line_y - boxes[:, 1:2, None]
         forward, lateral = map(np.abs, to_heading_frame(x, y, boxes[:, 2:3, None]))
         meets = (forward <= self.reach[:, 0]) & (lateral <= self.reach[:, 1])  # [N, l, P]
@@ -269,10 +270,3 @@ def _find_nearest(
     """Index of the point of a line that is nearest to each state."""
     x, y = x - motion[..., :1], y - motion[..., 1:2]
     return (x * x + y * y).argmin(-1)
-
-
-def _coasted(boxes: Float[np.ndarray, "N 5"], time_s: float) -> Float[np.ndarray, "N 5"]:
-    """Boxes at constant velocity after some time."""
-    moved = boxes.copy()
-    moved[:, :2] += time_s * boxes[:, 3:]
-    return moved
