@@ -174,11 +174,8 @@ def _drive(
     """Meters driven with an acceleration that goes on for a while, at most down to standstill."""
     stop_s = speed / np.maximum(-acceleration, 1e-6)
     held = np.minimum(np.minimum(time_s, HOLD_S), np.where(acceleration < 0, stop_s, np.inf))
-    return (
-        speed * held
-        + acceleration / 2 * held**2
-        + np.maximum(speed + acceleration * HOLD_S, 0.0) * (np.maximum(time_s - HOLD_S, 0.0))
-    )
+    coasted = np.maximum(speed + acceleration * HOLD_S, 0.0) * np.maximum(time_s - HOLD_S, 0.0)
+    return speed * held + acceleration / 2 * held**2 + coasted
 
 
 def _follow(

@@ -47,24 +47,19 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         DataError: no such data, a scenario that the planner cannot drive, or a folder that cannot be written to.
     """
     # everything that can be refused is refused before anything is driven
-    environments = [make_environment(config, traffic) for traffic in config.traffic]
-    ids = list(config.scenarios or environments[0].source.scenario_ids)[: config.limit]
+    sources = [make_environment(config, traffic).source for traffic in config.traffic]
+    ids = list(config.scenarios or sources[0].scenario_ids)[: config.limit]
     for scenario_id in ids:
-        environments[0].source.scenario(scenario_id)
-    common_settings = {
+        sources[0].scenario(scenario_id)
+    base = {
         "planner": config.planner, "dataset": config.data, "split": config.split, "num_rollouts": config.num_rollouts,
         "seed": config.seed, "seconds": float(config.seconds), "rlftsim_version": rlftsim.__version__,
         "planner_code": hash_code(config.planner),
         "manifest_sha256": hash_manifest(dataset_folder(config.data)),
     }  # fmt: skip
     drive_settings = [
-        DriveSettings(
-            traffic=traffic,
-            model=env.source.fingerprint,
-            entries=identify_entries(env.config.entries),
-            **common_settings,
-        )
-        for traffic, env in zip(config.traffic, environments)
+        DriveSettings(traffic=name, model=source.fingerprint, entries=identify_entries(source.config.entries), **base)
+        for name, source in zip(config.traffic, sources)
     ]
     # processes hand their rows over in files, so even results that are not kept need a folder
     with tempfile.TemporaryDirectory() as nowhere:

@@ -39,13 +39,10 @@ class DriverView(BaseFeaturesExtractor):
         steering = torch.where(last > 0, torch.atan(0.6 * length * curvature) / STEERING_RAD, 0.0)
 
         line = torch.where(has_point[..., None], route[..., :2], torch.full_like(route[..., :2], 1e4))
-        is_red = lights[..., 2:4].sum(-1) > 0
+        is_red = observation["lights_mask"].bool() & (lights[..., 2:4].sum(-1) > 0)
         distance = _measure_along_route(neighbors[..., :2], observation["neighbors_mask"], line)
         gap, leader = (distance - neighbors[..., 6] / 2 - length[:, None] / 2).min(-1)
-        stop = (
-            _measure_along_route(lights[..., :2], observation["lights_mask"].bool() & is_red, line).amin(-1)
-            - length / 2
-        )
+        stop = _measure_along_route(lights[..., :2], is_red, line).amin(-1) - length / 2
         gap, stop = gap.clamp(1.0, FAR_M), stop.clamp(1.0, FAR_M)
         closing = (speed - neighbors[torch.arange(len(ego)), leader, 4]) * (gap < FAR_M)
         limit = torch.where(limit > 0, limit, 13.0)

@@ -125,17 +125,13 @@ def build_episode(world: World, controls: Controls, config: EnvConfig, goals: Sc
         config: Settings of reward, route, ends and observations.
         goals: Goals that the world was built with, for snapshots.
     """
-    routes = tuple(
-        find_route(
-            world.scenes[scene].scenario,
-            int(agent),
-            config.route if agent == world.scenes[scene].ego else "logged",
-            world.scenes[scene].num_steps,
-        )
-        for scene, agent in world.actors
-    )
+    routes = []
+    for row, agent in world.actors:
+        scene = world.scenes[row]
+        choice = config.route if agent == scene.ego else "logged"
+        routes.append(find_route(scene.scenario, int(agent), choice, scene.num_steps))
     edges = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
-    return Episode(world, build_atlas(world, routes), controls, parse_terms(config.reward), config, edges, goals)
+    return Episode(world, build_atlas(world, tuple(routes)), controls, parse_terms(config.reward), config, edges, goals)
 
 
 def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
@@ -321,11 +317,8 @@ def has_left_map(episode: Episode, world: WorldState) -> Bool[np.ndarray, "M"]:
         world: State of the episode's scenes, at any step.
     """
     atlas, motion = episode.atlas, own_motion(episode, world)
-    distances = [
-        np.hypot(atlas.x[:, columns] - motion[:, :1], atlas.y[:, columns] - motion[:, 1:2]).min(1)
-        for columns in (atlas.columns["lanes"], atlas.columns["edges"])
-    ]
-    nearest = np.minimum(*distances)
+    columns = np.r_[atlas.columns["lanes"], atlas.columns["edges"]]
+    nearest = np.hypot(atlas.x[:, columns] - motion[:, :1], atlas.y[:, columns] - motion[:, 1:2]).min(1)
     return (nearest > MAP_END_M) & (nearest < FAR_M / 2)  # without a map there is only padding
 
 

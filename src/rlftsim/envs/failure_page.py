@@ -150,9 +150,7 @@ def _happens(chain: FailureChain, dice: Sequence[int], imposed: Float[np.ndarray
 def format_study(study: Study) -> Table:
     """Table of the scenarios, the most probable event first, for `print_wide`."""
     event = study.config.event.replace("_", " ")
-    table = Table(title=f"{event} of {study.config.planner} within 8 s", title_justify="left")
-    for heading in HEADINGS:
-        table.add_column(heading)
+    table = Table(*HEADINGS, title=f"{event} of {study.config.planner} within 8 s", title_justify="left")
     for row in study_rows(study):
         table.add_row(*row)
     return table
@@ -193,9 +191,8 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
         limit: Largest number of failures with a film.
     """
     failures = study.failures
-    exhibits = [
-        build_exhibit(study.config, failures.index(failure), failure) for failure in choose_failures(failures, limit)
-    ]
+    shown = choose_failures(failures, limit)
+    exhibits = [build_exhibit(study.config, failures.index(failure), failure) for failure in shown]
     cells = "".join(f"<th>{escape(heading)}</th>" for heading in HEADINGS)
     rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in study_rows(study))
     title = f"Failures of {study.config.planner}"
@@ -206,9 +203,8 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
     body = f'<h1>{escape(title)}</h1><p class="lead">{escape(intro)}</p>' + "\n".join(map(_exhibit_html, exhibits))
     table = f'<div class="table-scroll"><table class="failures-table"><tr>{cells}</tr>{rows}</table></div>'
     problems = "".join(f"<p>Left out: {escape(problem)}</p>" for problem in study.problems.values())
-    write_text(
-        path, page_html(title, f"{body}<h2>Scenarios</h2>{table}{problems}", extra_css=read_asset("failures.css"))
-    )
+    body += f"<h2>Scenarios</h2>{table}{problems}"
+    write_text(path, page_html(title, body, extra_css=read_asset("failures.css")))
 
 
 def _exhibit_html(exhibit: Exhibit) -> str:

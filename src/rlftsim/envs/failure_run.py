@@ -117,9 +117,8 @@ def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict
     except PlannerFailure as error:  # other scenarios may be driven
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
     driven_m = float(np.mean([path.driven_m for path in paths]))
-    return asdict(
-        Pilot(ids[position], tuple(danger.max(1).tolist()), driven_m, sum(len(path.motion) for path in paths))
-    )
+    worst = tuple(danger.max(1).tolist())
+    return asdict(Pilot(ids[position], worst, driven_m, sum(len(path.motion) for path in paths)))
 
 
 def _read_pilot(name: str, values: Mapping[str, Any]) -> Pilot:

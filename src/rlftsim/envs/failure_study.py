@@ -111,10 +111,8 @@ class StudyConfig:
             planner: Name of another planner among the same traffic.
         """
         driver, source = load_source(replace(self, planner=planner or self.planner))
-        first_number = number * NUMBERS_PER_ROUND
-        return FailureChain(
-            source, driver, scenario_id, find_event(self.event), seed=self.seed, first_number=first_number
-        )
+        event, first_number = find_event(self.event), number * NUMBERS_PER_ROUND
+        return FailureChain(source, driver, scenario_id, event, seed=self.seed, first_number=first_number)
 
 
 @lru_cache(maxsize=8)

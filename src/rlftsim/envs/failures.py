@@ -189,13 +189,12 @@ class FailureChain:
         state = start(episode, self._dice(dice[:, 0]))
         danger = np.full((size, 1 + self.num_blocks * self.block_steps), np.nan)
         planners = [self.planner] * size
-        copies: list[list[Planner]] = [
-            list(path.planners[: k + 1]) if path else [] for path, k in zip(parent_paths, shared)
-        ]
+        copies: list[list[Planner]] = [[] for _ in rows]
         for row, (path, k) in enumerate(zip(parent_paths, shared)):
             if path is None:
                 danger[row, 0] = self.event.danger(StepView(episode, state, row))
             else:
+                copies[row] = list(path.planners[: k + 1])
                 danger[row, : 1 + k * self.block_steps] = path.danger[: 1 + k * self.block_steps]
         for block in range(self.num_blocks):
             begin = block * self.block_steps
@@ -257,18 +256,13 @@ class FailureChain:
         """
         seed = (self.seed, self.first_number)
         splits = split(self, particles=particles, repeats=repeats, seed=seed, is_branching=is_branching)
-        return tuple(
-            Repeat(
-                probability=float(splits.probability[row]),
-                num_levels=int(splits.num_levels[row]),
-                num_steps=int(splits.num_runs[row]) * self.num_blocks * self.block_steps,
-                failures=tuple(
-                    self._describe(path, float(splits.weight[row]))
-                    for path in splits.paths[row][splits.danger[row] >= 0]
-                ),
-            )
-            for row in range(repeats)
-        )
+        estimates = []
+        for row, probability in enumerate(splits.probability.tolist()):
+            failing, weight = splits.paths[row][splits.danger[row] >= 0], float(splits.weight[row])
+            num_steps = int(splits.num_runs[row]) * self.num_blocks * self.block_steps
+            failures = tuple(self._describe(path, weight) for path in failing)
+            estimates.append(Repeat(probability, int(splits.num_levels[row]), num_steps, failures))
+        return tuple(estimates)
 
     def check_start(self) -> None:
         """Check that the event does not hold at the start.

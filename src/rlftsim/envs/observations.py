@@ -412,12 +412,8 @@ def _leave_out_other_levels(
     ground = z[scene, agent] - half[:, 0]
     above_route = ground - atlas.route_ground[np.arange(len(scene)), nearest_on_route]
     # a box as high as the agent's whose height difference is 0 stands on the same ground
-    neighbors = RouteHeights.measure(
-        state.motion[scene][..., :2],
-        z[scene] - half,
-        atlas.route_points[..., None].view(np.float64),
-        atlas.route_ground,
-    )
+    route_xy = atlas.route_points[..., None].view(np.float64)
+    neighbors = RouteHeights.measure(state.motion[scene][..., :2], z[scene] - half, route_xy, atlas.route_ground)
     for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
         difference = heights.differences(np.sqrt(distances[name]), ground, above_route)
         if name == "neighbors":

@@ -213,11 +213,9 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     if edges is None:
         return np.full(record.steps + 1, -np.inf)
     motion = record.agent_motion
-    corners = (
-        clockwise_corners(motion[:, :2], motion[:, 2], scene.size[record.agent]) + scene.scenario.origin
-    )  # [T + 1, 4, 2]
+    corners = clockwise_corners(motion[:, :2], motion[:, 2], scene.size[record.agent])  # [T + 1, 4, 2]
     z = np.repeat(record.ground[record.agent][:, None, None], 4, 1)
-    points = torch.from_numpy(np.concatenate([corners, z], -1)).float()
+    points = torch.from_numpy(np.concatenate([corners + scene.scenario.origin, z], -1)).float()
     # the corners of a few steps lie close together
     groups = points.reshape(-1, 4 * math.gcd(len(points), 9), 3)
     distance = compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS)

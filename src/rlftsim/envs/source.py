@@ -76,9 +76,9 @@ class Source:
             check_sumo()
         # IDM leaves pedestrians and cyclists to the policy
         needs_policy = "policy" in self.rules.values() or "idm" in self.rules.values() or config.action == "token"
-        self.policy = (
-            policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
-        )
+        if policy is None and needs_policy:
+            policy = load_policy(config.model, config.device)
+        self.policy = policy
         self.entries = load_open_traffic(config.entries, self.rules, self.policy)
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
         self.controls: Controls = build_controls(

@@ -1,7 +1,7 @@
 """Many ego environments at once: scenes that are reset together step together, with a single network call for all."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,11 +36,11 @@ class _Group:
     state: EpisodeState
     slots: Int64[np.ndarray, "B"]
     """Slot of each scene; -1 = none any more."""
-    live: Int64[np.ndarray, "b"] = field(init=False)
-    """Scenes with a slot."""
 
-    def __post_init__(self) -> None:
-        self.live = np.flatnonzero(self.slots >= 0)
+    @property
+    def live(self) -> Int64[np.ndarray, "b"]:
+        """Scenes with a slot."""
+        return np.flatnonzero(self.slots >= 0)
 
 
 class EgoVectorEnv(VectorEnv):
@@ -245,10 +245,9 @@ class EgoVectorEnv(VectorEnv):
         if episode.num_agents != len(slots):
             raise ConfigError("the planner drives more than the egos: take rlftsim.envs.parallel_env.")
         # groups lose the slots that went on, and are dropped when they have none left
-        groups = [
-            replace(group, slots=np.where(np.isin(group.slots, slots), -1, group.slots)) for group in self._groups
-        ]
-        self._groups = [*(group for group in groups if len(group.live)), _Group(episode, state, np.array(slots))]
+        for group in self._groups:
+            group.slots[np.isin(group.slots, slots)] = -1
+        self._groups = [*(group for group in self._groups if len(group.live)), _Group(episode, state, np.array(slots))]
         self._over[slots] = False
         for row, i in enumerate(slots):
             notes[i] = describe_start(episode, state, row, self.source)

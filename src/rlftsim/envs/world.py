@@ -218,10 +218,8 @@ def build_world(
     simulated = (drivers != Driver.REPLAY)[..., None]
     is_present = mask[..., None] & (simulated | goes_on)
     is_present[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
-    driven = [
-        np.flatnonzero((row == Driver.PLANNER) | (np.arange(shape[1]) == scene.ego))
-        for row, scene in zip(drivers, scenes)
-    ]
+    is_driven = drivers == Driver.PLANNER
+    is_driven[np.arange(len(scenes)), [scene.ego for scene in scenes]] = True
     idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
     return World(
         scenes=scenes,
@@ -247,8 +245,8 @@ def build_world(
         lines=tuple(build_idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
         sumo_scenes=tuple(build_sumo_scene(scene, data) for scene in by_sumo if data is not None),
         open_worlds=tuple(
-            OpenWorld(scene.scenario, shape[1], entries, rows)
-            for scene, rows in zip(scenes, driven) if entries is not None
+            OpenWorld(scene.scenario, shape[1], entries, np.flatnonzero(row))
+            for scene, row in zip(scenes, is_driven) if entries is not None
         ),
     )  # fmt: skip
 
@@ -528,10 +526,8 @@ def _decision_noise(world: World, dice: Sequence[Dice], block: int) -> Tensor:
 
 def _noise(world: World, dice: Sequence[Dice], purpose: str, per_agent: int) -> Float[Tensor, "B 1 A k"]:
     """Noise of scenes with dice per scene, as `simulate` draws for each scene."""
-    return torch.cat([
-        draw_noise(
-            scenario_batch, range(scene_dice.rollout, scene_dice.rollout + 1), seed=scene_dice.seed, purpose=purpose,
-            per_agent=per_agent,
-        )
-        for scenario_batch, scene_dice in zip(world.batch.split(1), dice)
-    ])  # fmt: skip
+    noise = []
+    for scenario_batch, drawn in zip(world.batch.split(1), dice):
+        ids = range(drawn.rollout, drawn.rollout + 1)
+        noise.append(draw_noise(scenario_batch, ids, seed=drawn.seed, purpose=purpose, per_agent=per_agent))
+    return torch.cat(noise)

@@ -144,9 +144,8 @@ class OpenWorld:
 
     def begin(self, num_rollouts: int) -> Presence:
         """Presence before the first decision: all agents of the log, and no visitor."""
-        is_present = np.broadcast_to(
-            np.arange(len(self.waiting)) < self.first_visitor, (num_rollouts, len(self.waiting))
-        )
+        is_logged = np.arange(len(self.waiting)) < self.first_visitor
+        is_present = np.broadcast_to(is_logged, (num_rollouts, len(self.waiting)))
         path = np.broadcast_to(self.waiting[:, None], (*is_present.shape, DECISION_STEPS, 3))
         return Presence(is_present, np.zeros_like(is_present), (0,) * num_rollouts, ~is_present, path)
 

@@ -105,14 +105,9 @@ class RlftsimAgents:
         logged = self.scenario.get_tracked_objects_at_iteration(self.index).tracked_objects
         objects = [other for other in logged if other.tracked_object_type.name not in (*TYPES, EGO)]
         for agent, (x, y, heading, vx, vy) in zip(self.agents, motion[1:].tolist()):
-            objects.append(
-                Agent(
-                    tracked_object_type=agent.tracked_object_type,
-                    oriented_box=OrientedBox.from_new_pose(agent.box, StateSE2(x, y, heading)),
-                    velocity=StateVector2D(vx, vy),
-                    metadata=replace(agent.metadata, timestamp_us=self.time_us),
-                )
-            )
+            box = OrientedBox.from_new_pose(agent.box, StateSE2(x, y, heading))
+            metadata = replace(agent.metadata, timestamp_us=self.time_us)
+            objects.append(Agent(agent.tracked_object_type, box, StateVector2D(vx, vy), metadata))
         return self.observation_type()(TrackedObjects(objects))
 
     def update_observation(self, iteration: Any, next_iteration: Any, history: Any) -> None:

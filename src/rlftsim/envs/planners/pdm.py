@@ -145,9 +145,7 @@ class _Meetings:
         scene, column = np.nonzero(_nears_line(view))
         boxes, size, heading = view.boxes[scene, column], view.box_size[scene, column], view.heading[scene]
         turn, half = heading - boxes[:, 2:3], view.size[scene, 1:] / 2
-        reach = [
-            size[:, axis : axis + 1] / 2 + half * np.abs(across(turn)) for axis, across in enumerate((np.sin, np.cos))
-        ]
+        reach = [size[:, [axis]] / 2 + half * np.abs(across(turn)) for axis, across in enumerate((np.sin, np.cos))]
         speed = boxes[:, 3:4] * np.cos(heading) + boxes[:, 4:5] * np.sin(heading)
         x, y = np.ascontiguousarray(np.moveaxis(lines[scene], -1, 0))
         return cls(scene, boxes, x, y, np.stack(reach, 1)[:, :, None], np.maximum(speed, 0.0))
