@@ -77,9 +77,8 @@ def build_exhibit(config: StudyConfig, number: int, failure: Failure) -> Exhibit
     if not _happens(chain, failure.dice, brake(record, failure.step)):
         avoided_by.append(f"full braking {EARLIER_STEPS * STEP_S:g} s earlier")
     undisturbed = TrafficLog()
-    config.chain(failure.scenario_id).run(
-        np.repeat(np.arange(config.pilot)[:, None], chain.num_blocks, 1), observe=undisturbed.observe
-    )
+    dice = np.repeat(np.arange(config.pilot)[:, None], chain.num_blocks, 1)
+    config.chain(failure.scenario_id).run(dice, observe=undisturbed.observe)
     rank = float(np.mean(undisturbed.until(failure.step)[: config.pilot] < log.until(failure.step)[0]))
     is_ranked = bool(log.log_prob)
     return Exhibit(number, failure, record, tuple(avoided_by), rank if is_ranked else np.nan)

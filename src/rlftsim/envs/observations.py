@@ -16,6 +16,7 @@ from jaxtyping import Bool, Complex, Float, Float32, Int8, Int64
 from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
 from rlftsim.envs.drivers import Driver
 from rlftsim.envs.levels import RouteHeights, is_on_level
+from rlftsim.envs.road import measure_square
 from rlftsim.envs.route import Route, compute_headings
 from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW, Lights
 from rlftsim.envs.world import World, WorldState, find_lights, find_presence, padded
@@ -264,11 +265,11 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     is_present = _find_history(world, state)  # [B, A, 11]
 
     # 1. Squared distances, infinite where there is nothing to see.
-    squared = _measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]
+    squared = measure_square(atlas.x - motion[:, :1], atlas.y - motion[:, 1:2])  # [M, N]
     distances = {name: squared[:, columns] for name, columns in atlas.columns.items()}
     nearest_on_route = distances.pop("route").argmin(1)
     to_others = distances["neighbors"][:, : others.shape[1]]
-    to_others[...] = _measure_square(others[..., 0] - motion[:, :1], others[..., 1] - motion[:, 1:2])
+    to_others[...] = measure_square(others[..., 0] - motion[:, :1], others[..., 1] - motion[:, 1:2])
     to_others[~is_present[..., -1].take(scene, axis=0)] = np.inf
     lights = atlas.lights
     if state.sumo_states:
@@ -382,14 +383,6 @@ def _measure_ego(
     return np.stack([speed[-1], (speed[-1] - speed[-2]) / STEP_S, yaw_rate, steering], -1)
 
 
-def _measure_square(x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
-    """Squared lengths of vectors, which take the place of `x`; `y` is changed, too."""
-    x *= x
-    y *= y
-    x += y
-    return x
-
-
 def _leave_out_other_levels(
     world: World,
     atlas: Atlas,
@@ -447,7 +440,7 @@ def _compare_with_lane(
     turn = atlas.lane_direction.reshape(-1, SEGMENT_POINTS).take(lanes, axis=0).reshape(len(lanes), -1)
     offset = offset[:, : turn.shape[1]]
     # the point that is nearest among those of lanes that run the agent's way
-    squared = _measure_square(np.real(offset).copy(), np.imag(offset).copy())
+    squared = measure_square(np.real(offset).copy(), np.imag(offset).copy())
     squared[np.real(turn * forward.conj()) <= 0] = np.inf
     squared.reshape(*lanes.shape, -1)[is_hidden] = np.inf
     best = np.arange(len(lanes)), squared.argmin(1)

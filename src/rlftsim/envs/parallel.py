@@ -9,7 +9,6 @@ from gymnasium.spaces import Space
 from pettingzoo import ParallelEnv
 
 from rlftsim.envs.actions import validate_actions
-from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import Driver, assign_drivers
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look
 from rlftsim.envs.resets import OPTIONS, EpisodeOrder, begin_episodes, build_config, describe_start, describe_step
@@ -21,17 +20,9 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.open import AnyScenarios
 from rlftsim.scenario.types import TOTAL_STEPS
 
-Controlled = str | Sequence[int | str]
 
-
-def parallel_env(
-    *,
-    controlled: Controlled = "ego",
-    scenarios: AnyScenarios | None = None,
-    policy: Policy | None = None,
-    **settings: Any,
-) -> "TrafficParallelEnv":
-    """A PettingZoo parallel environment.
+class TrafficParallelEnv(ParallelEnv):
+    """A PettingZoo environment: planner-driven agents of a scene, named by object ids.
 
     Args:
         controlled: Planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
@@ -42,45 +33,40 @@ def parallel_env(
     Raises:
         ConfigError: settings that do not fit each other, or no agents.
     """
-    if not isinstance(controlled, str):
-        try:
-            # names of agents are their ids as text
-            ids = (int(name) if isinstance(name, str) else index(name) for name in controlled)
-            controlled = list(dict.fromkeys(ids))
-        except (TypeError, ValueError):
-            raise ConfigError("controlled must be a group such as 'vehicles', or a list of object ids.") from None
-        if not controlled:
-            raise ConfigError("controlled is empty: name at least one object id, or a group such as 'vehicles'.")
-    rules = dict.fromkeys([controlled] if isinstance(controlled, str) else controlled, "planner")
-    return TrafficParallelEnv(controlled, Source(build_config(settings), scenarios, policy, rules))
-
-
-class TrafficParallelEnv(ParallelEnv):
-    """Planner-driven agents of a scene, named by object ids.
-
-    Args:
-        controlled: Planner-driven agents: a group such as "vehicles", or object ids.
-        source: Scenarios, traffic model and settings, with the rules of the planner-driven agents.
-    """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "rlftsim/Traffic-v0", "render_modes": [], "is_parallelizable": True}
 
-    def __init__(self, controlled: Controlled, source: Source):
-        config: EnvConfig = source.config
+    def __init__(
+        self,
+        *,
+        controlled: str | Sequence[int | str] = "ego",
+        scenarios: AnyScenarios | None = None,
+        policy: Policy | None = None,
+        **settings: Any,
+    ):
+        if not isinstance(controlled, str):
+            try:
+                # names of agents are their ids as text
+                ids = (int(name) if isinstance(name, str) else index(name) for name in controlled)
+                controlled = list(dict.fromkeys(ids))
+            except (TypeError, ValueError):
+                raise ConfigError("controlled must be a group such as 'vehicles', or a list of object ids.") from None
+            if not controlled:
+                raise ConfigError("controlled is empty: name at least one object id, or a group such as 'vehicles'.")
+        rules = dict.fromkeys([controlled] if isinstance(controlled, str) else controlled, "planner")
+        self.source, self.render_mode = Source(build_config(settings), scenarios, policy, rules), None
+        config = self.source.config
         if config.render_mode is not None or config.observation == "arrays":
             raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
-        self.source, self.render_mode = source, None
-        self._spaces = observation_space(config.observation), action_space(source.controls)
+        self._spaces = observation_space(config.observation), action_space(self.source.controls)
         self._order = EpisodeOrder.from_seed(None)
         self._begun: tuple[Episode, EpisodeState] | None = None
         self.agents: list[str] = []
         self._names: list[str] = []
         # all agents that there may be: PettingZoo wants to know them before the first reset
-        self.possible_agents = self._all_agents(controlled)
+        self.possible_agents = self._list_group() if isinstance(controlled, str) else list(map(str, controlled))
 
-    def _all_agents(self, controlled: Controlled) -> list[str]:
-        if not isinstance(controlled, str):
-            return [str(object_id) for object_id in controlled]
+    def _list_group(self) -> list[str]:
         names: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
             scene = build_env_scene(self.source.scenario(scenario_id), TOTAL_STEPS)
@@ -156,3 +142,7 @@ class TrafficParallelEnv(ParallelEnv):
         assert self._begun is not None
         observation, form = look(*self._begun), self.source.config.observation
         return {name: format_observation(observation, form, self._names.index(name)) for name in names}
+
+
+parallel_env = TrafficParallelEnv
+"""PettingZoo's name for what makes such an environment."""

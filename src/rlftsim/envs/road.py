@@ -42,8 +42,7 @@ def nearest_edges(
     position += to_y * dy
     position /= np.maximum(dx * dx + dy * dy, 1e-9)
     clipped_position = position.clip(0.0, 1.0)
-    squared = _square(to_x - clipped_position * dx)
-    squared += _square(to_y - clipped_position * dy)
+    squared = measure_square(to_x - clipped_position * dx, to_y - clipped_position * dy)
     nearest = squared.argmin(-1)[..., None]
     values = (squared, dx, dy, to_x, to_y, position)
     squared, dx, dy, to_x, to_y, position = (
@@ -52,7 +51,9 @@ def nearest_edges(
     return np.sqrt(squared), dx * to_y - dy * to_x, (position >= 0.0) & (position <= 1.0)
 
 
-def _square(values: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
-    """Squares, which take the place of the values."""
-    values *= values
-    return values
+def measure_square(x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
+    """Squared lengths of vectors, which take the place of `x`; `y` is changed, too."""
+    x *= x
+    y *= y
+    x += y
+    return x

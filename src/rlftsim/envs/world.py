@@ -321,9 +321,8 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         follows = world.agents[Driver.POLICY]
         motion[follows] = np.concatenate([poses, velocity], -1)[follows]
     coasts = world.agents[Driver.CONSTANT_VELOCITY]
-    if len(coasts[0]):
-        motion[coasts] = previous[coasts]
-        motion[(*coasts, slice(2))] += STEP_S * previous[coasts][:, 3:]
+    motion[coasts] = previous[coasts]
+    motion[(*coasts, slice(2))] += STEP_S * previous[coasts][:, 3:]
     # 2. IDM-driven vehicles
     idm_states, driven = state.idm_states, world.agents[Driver.IDM]
     if len(driven[0]):

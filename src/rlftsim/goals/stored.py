@@ -32,13 +32,10 @@ def write_goal_file(path: Path, goals: Mapping[str, Points]) -> None:
         path: File to write; the files of a folder are read in the order of names.
         goals: Object ids and points by scenario id, world frame, m.
     """
-    columns = {
-        "scenario_id": np.repeat(list(goals), [len(ids) for ids, _ in goals.values()]),
-        "object_id": np.concatenate([ids for ids, _ in goals.values()]),
-        "x": np.concatenate([points[:, 0] for _, points in goals.values()]),
-        "y": np.concatenate([points[:, 1] for _, points in goals.values()]),
-    }
-    table = pa.table({name: pa.array(values, SCHEMA.field(name).type) for name, values in columns.items()}, SCHEMA)
+    scenario_ids = np.repeat(list(goals), [len(ids) for ids, _ in goals.values()])
+    object_ids, points = (np.concatenate(values) for values in zip(*goals.values()))
+    columns = zip((scenario_ids, object_ids, *points.T), SCHEMA)
+    table = pa.table([pa.array(values, column.type) for values, column in columns], schema=SCHEMA)
     write_atomically(path, lambda temporary: pq.write_table(table, temporary))
 
 

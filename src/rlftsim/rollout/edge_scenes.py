@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from rlftsim.geometry import wrapped
-from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, MapFeatures, Scenario, Tracks
+from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, MapFeatures, Scenario
 
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
 """53.13 degrees: sine 4/5 and cosine 3/5 are short fractions, so rotated grid points stay exact in float32."""
@@ -85,10 +85,9 @@ def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:
 
 def _with_tracks(scenario: Scenario, indices: np.ndarray) -> Scenario:
     """Some of the tracks, in the given order; only the ego is evaluated."""
-    fields = {name: getattr(scenario.tracks, name)[indices] for name in Tracks.__dataclass_fields__}
     return replace(
         scenario,
-        tracks=Tracks(**fields),
+        tracks=scenario.tracks.select(indices),
         ego_index=int(np.flatnonzero(indices == scenario.ego_index)[0]),
         tracks_to_predict=scenario.tracks_to_predict[:0],
         difficulty=scenario.difficulty[:0],

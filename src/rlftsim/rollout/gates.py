@@ -55,25 +55,20 @@ class GateFinder:
 
     def __init__(self, scenario: Scenario):
         graph = lane_graph(scenario)
-        points, headings, speeds, follows = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, bool)]
-        distances = [np.zeros(0)]
+        parts = [(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, bool), np.zeros(0))]
         for line, limit in zip(graph.lines, graph.speed_limit_mps):
             count = max(int(np.ceil(arc_length(line)[-1] / SPACING_M)), 1) + 1
             sampled = resample_to(line[:, :2] - scenario.origin, count)
             direction = np.diff(sampled, axis=0, append=2 * sampled[-1:] - sampled[-2:-1])
-            points.append(sampled)
-            headings.append(np.arctan2(direction[:, 1], direction[:, 0]))
-            speeds.append(np.full(count, CRUISE * (limit or UNKNOWN_LIMIT_MPS)))
-            follows.append(np.arange(count) < count - 1)
-            distances.append(arc_length(sampled))
-        self.points, self.heading = np.concatenate(points), np.concatenate(headings)
-        self.speed, self.is_followed = np.concatenate(speeds), np.concatenate(follows)
+            heading, speed = np.arctan2(direction[:, 1], direction[:, 0]), CRUISE * (limit or UNKNOWN_LIMIT_MPS)
+            is_followed = np.arange(count) < count - 1
+            parts.append((sampled, heading, np.full(count, speed), is_followed, arc_length(sampled)))
+        self.points, self.heading, self.speed, self.is_followed, self._along_m = map(np.concatenate, zip(*parts))
+        self._first, self._successors = np.cumsum([len(part[0]) for part in parts]), graph.successors  # of each lane
         ends = [
             line[-1, :2] - scenario.origin for line, successors in zip(graph.lines, graph.successors) if not successors
         ]
         self.ends = np.array(ends).reshape(-1, 2)
-        self._along_m, self._successors = np.concatenate(distances), graph.successors
-        self._first = np.concatenate([[0], np.cumsum([len(line) for line in points])])[1:]  # of each lane
 
     def find(self, ego: Float[np.ndarray, "2"], ego_velocity: Float[np.ndarray, "2"], region_m: float) -> Gates:
         """Gates of a region.

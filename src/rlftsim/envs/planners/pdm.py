@@ -44,15 +44,6 @@ _NEVER = 1 << 20
 """Index of no point."""
 
 
-@dataclass(frozen=True, eq=False)
-class Proposals:
-    """Simulated motions, and the controls that lead there."""
-
-    motion: Float[np.ndarray, "M n T1 5"]
-    controls: Float[np.ndarray, "M n T 2"]
-    """Acceleration (m/s²) and steering (rad)."""
-
-
 class PdmPlanner(BatchPlanner):
     """The best of 15 proposals: 5 fractions of the wanted speed times 3 offsets from the route."""
 
@@ -71,11 +62,11 @@ class PdmPlanner(BatchPlanner):
         """The next controls of the plans, which are made anew every half second."""
         if not self._plan.shape[1]:
             view = read_view(observe())
-            proposals = simulate_proposals(view)
-            collides = collisions(view, proposals.motion)
-            best = score_proposals(view, proposals.motion, collides).argmax(1)
+            motion, proposed_controls = simulate_proposals(view)
+            collides = collisions(view, motion)
+            best = score_proposals(view, motion, collides).argmax(1)
             row = np.arange(len(best))
-            controls = proposals.controls[row, best, :REPLAN_STEPS]
+            controls = proposed_controls[row, best, :REPLAN_STEPS]
             is_braking = collides[row, best, : round(BRAKE_IF_WITHIN_S / STEP_S) + 1].any(1)
             controls[is_braking, :, 0] = -ACCELERATION_MPS2
             scale = np.array([ACCELERATION_MPS2, STEERING_RAD])
@@ -84,8 +75,11 @@ class PdmPlanner(BatchPlanner):
         return control
 
 
-def simulate_proposals(view: View) -> Proposals:
-    """Drive along the route at several speeds and offsets for 4 s; all other agents keep a constant velocity."""
+def simulate_proposals(view: View) -> tuple[Float[np.ndarray, "M n T1 5"], Float[np.ndarray, "M n T 2"]]:
+    """Motion along the route at several speeds and offsets for 4 s, and its acceleration (m/s²) and steering (rad).
+
+    All other agents keep a constant velocity.
+    """
     count, num_lines, num_speeds = len(view.speed), len(OFFSETS_M), len(SPEED_FRACTIONS)
     shape, bicycle = (count, num_lines, num_speeds), Bicycle()  # the proposals of an offset share a line
     limit = np.where(view.limit_mps > 0, view.limit_mps, CONFIG.speed_mps)
@@ -122,7 +116,7 @@ def simulate_proposals(view: View) -> Proposals:
         states.append(motion)
         controls.append(np.stack([acceleration, steering], -1))
     size = count, num_lines * num_speeds
-    return Proposals(np.stack(states, 3).reshape(*size, -1, 5), np.stack(controls, 3).reshape(*size, -1, 2))
+    return np.stack(states, 3).reshape(*size, -1, 5), np.stack(controls, 3).reshape(*size, -1, 2)
 
 
 @dataclass(frozen=True, eq=False)
