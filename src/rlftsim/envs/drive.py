@@ -6,7 +6,6 @@ Interrupted in any way, the same call goes on where the work stopped, see `evalu
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from rlftsim.evaluation.resumable import (
     read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.items import ResultFormat, group_positions, run_items
+from rlftsim.jobs.items import group_positions, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
@@ -130,14 +129,14 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    files = ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
+    files = _SideBySide(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
     runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
     with claim_result(path, files, ids, find, runner) as claim:
         if claim.lease is not None:
             groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
             title = f"{config.planner} in {settings.traffic}"
             task = partial(_drive_group, config, settings.traffic, files)
-            stored = run_items(title, groups, task, format=_Groups(files), lease=claim.lease, runner=runner)
+            stored = run_items(title, groups, task, format=files, lease=claim.lease, runner=runner)
             rows = [row for group in stored for row in group]
             missing = {row["scenario_id"]: reasons for row, reasons in rows}
             claim.result = DriveResult.of(settings, [row for row, _ in rows], missing)
@@ -148,31 +147,19 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
 Row = tuple[dict[str, Any], dict[str, str]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Groups(ResultFormat[range, list[Row]]):
+class _SideBySide(ScenarioValues[Any]):
     """Scenarios that are driven side by side, with a file for each."""
-
-    files: ScenarioValues[Row]
 
     def read(self, item: range) -> list[Row] | None:
         """Rows of all scenarios of a group, see `ResultFormat`."""
-        rows = [self.files.read(range(position, position + 1)) for position in item]
-        finished = [row for row in rows if row is not None]
-        return finished if len(finished) == len(item) else None
-
-    def count_units(self, item: range) -> int:
-        """Number of scenarios, see `ResultFormat`."""
-        return self.files.count_units(item)
-
-    def describe(self, item: range) -> str:
-        """First and last position, see `ResultFormat`."""
-        return self.files.describe(item)
+        rows: list[Any] = [ScenarioValues.read(self, range(position, position + 1)) for position in item]
+        return None if None in rows else rows
 
 
 def _drive_group(
     config: DriveConfig,
     traffic: str,
-    files: ScenarioValues[Row],
+    files: _SideBySide,
     group: range,
     advance: Advance,
     is_stopped: Callable[[], bool],
