@@ -216,17 +216,12 @@ class Study:
         half = float(stats.t.ppf(0.975, degrees)) * math.sqrt(variance) / mean
         return mean, mean * math.exp(-half), min(mean * math.exp(half) + hidden, 1.0)
 
-    @property
-    def km_and_hours(self) -> tuple[float, float]:
-        """Kilometers and hours that an episode drives on average."""
-        _, source = load_source(self.config)
-        km = float(np.mean([s.pilot.driven_m for s in self.scenarios])) / 1000
-        return km, source.config.max_steps * STEP_S / 3600
-
     def describe_total(self) -> str:
         """Events per 1 000 km and per hour driven, with interval."""
-        values, (km, hours) = self.mean_interval(), self.km_and_hours
-        texts = []
+        values, texts = self.mean_interval(), []
+        # that an episode drives on average
+        km = float(np.mean([s.pilot.driven_m for s in self.scenarios])) / 1000
+        hours = load_source(self.config)[1].config.max_steps * STEP_S / 3600
         for unit, size in (("1 000 km", km / 1000), ("hour", hours)):
             rate, low, high = (value / size if size else math.nan for value in values)
             interval = f" [{format_rate(low)}, {format_rate(high)}]" if math.isfinite(low) else ""

@@ -102,7 +102,9 @@ def score_planner(record: Record) -> PlannerScores:
     Args:
         record: Record of the episode; a short episode is scored up to the end.
     """
-    missing, steps, kinematics = missing_scores(record), _measure_steps(record), _kinematics(record)
+    missing, kinematics, (angle, limit, junction) = missing_scores(record), _kinematics(record), _lane_headings(record)
+    time_s = _compute_times_to_collision(record, junction)
+    steps = {"off_road_m": off_road(record), "lane_angle": angle, "limit_mps": limit, "time_to_collision_s": time_s}
     components = _score_components(record, steps, kinematics)
     early = record.first(PDMS_STEPS)
     early_steps = {name: values[: PDMS_STEPS + 1] for name, values in steps.items()}
@@ -163,12 +165,6 @@ def missing_scores(record: Record) -> dict[str, str]:
 
 Measures = dict[str, Float[np.ndarray, "_"]]
 """Numbers of each step by name, which several scores share."""
-
-
-def _measure_steps(record: Record) -> Measures:
-    angle, limit, junction = _lane_headings(record)
-    time_s = _compute_times_to_collision(record, junction)
-    return {"off_road_m": off_road(record), "lane_angle": angle, "limit_mps": limit, "time_to_collision_s": time_s}
 
 
 def _score_components(record: Record, steps: Measures, kinematics: Measures) -> dict[str, float]:

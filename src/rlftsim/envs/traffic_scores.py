@@ -17,7 +17,7 @@ from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, measure_wrong_way
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
-from rlftsim.realism import METRIC_2025, MetricConfig, SimulatedStates, score
+from rlftsim.realism import METRIC_2025, SimulatedStates, score
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import compute_distance_to_road_edge
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, ObjectType, Scenario, cached_on_scenario
@@ -163,7 +163,7 @@ def _leave_out_ego(scenario: Scenario) -> _WithoutEgo:
     return _WithoutEgo(**{field.name: getattr(scenario, field.name) for field in fields(Scenario)})
 
 
-def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
+def compute_traffic_realism(records: Sequence[Record]) -> float:
     """Realism meta-metric of the agents to predict, the ego left out, over rollouts of a scenario.
 
     NaN where realism cannot be measured: no future, no road edges, an episode that ended early, or no other agent to
@@ -171,7 +171,6 @@ def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = ME
 
     Args:
         records: Records of the same scenario, at least one, a rollout each.
-        config: Version of the metric; 2025 by default.
     """
     scene = records[0].scene
     scenario = _leave_out_ego(scene.scenario)
@@ -182,4 +181,4 @@ def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = ME
     world = (motion[..., :2] + torch.from_numpy(scene.scenario.origin)).float()
     z = torch.from_numpy(scene.z).float()[None, :, None].expand(world.shape[:-1])
     states = SimulatedStates(scene.object_id, world[..., 0], world[..., 1], z, motion[..., 2].float())
-    return float(score(scenario, states, config).meta_metric)
+    return float(score(scenario, states, METRIC_2025).meta_metric)

@@ -217,12 +217,6 @@ def path_through(points: Float[np.ndarray, "n 3"], start_heading: float, limits:
     return LanePath(points, turn, start_heading, limits)
 
 
-def smooth_step(x: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Cubic smooth step: 0 up to 0, 1 from 1 on, flat at both ends."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
-
-
 def shorten_path(path: LanePath, index: int) -> LanePath:
     """The path up to one of the points.
 
@@ -276,7 +270,8 @@ def _follow_chain(
     middle, limits = (values[: int(length_m / SPACING_M) + 1] for values in _resample(middle, limits))
     # 2. The agent's offset from the middle at the start fades out along the path.
     offset = pose.position[:2] - middle[0, :2]
-    fade = 1.0 - smooth_step(SPACING_M * np.arange(len(middle)) / ease_m)
+    eased = np.clip(SPACING_M * np.arange(len(middle)) / ease_m, 0.0, 1.0)
+    fade = 1.0 - eased * eased * (3.0 - 2.0 * eased)  # a cubic smooth step
     middle[:, :2] += fade[:, None] * offset
     return path_through(middle, pose.heading, limits)
 
