@@ -293,7 +293,7 @@ def _measure(
         logged = agents.trajectories.select_agents(agents.evaluated).from_step(-num_steps)
         displacement = compute_displacement_error(future, logged, agents.valid.index_select(0, agents.evaluated))
     return Features(
-        **{name: values[..., -num_steps:] for name, values in kinematics._asdict().items()},
+        **{name: values[..., -num_steps:] for name, values in kinematics.items()},
         distance_to_nearest_object=nearest,
         time_to_collision=time_to_collision,
         distance_to_road_edge=_compute_road_edge(scene, future, size, valid, max_pairs),
