@@ -383,9 +383,7 @@ def _fingerprint(files: tuple[Path, ...], settings: Mapping[str, object]) -> tup
     return size, digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-def _finish(
-    folder: Path, new: list[ShardEntry], source: DataSource, license_note: str | None, lease: Lease
-) -> Manifest:
+def _finish(folder: Path, new: list[ShardEntry], source: DataSource, note: str | None, lease: Lease) -> Manifest:
     """Write index and manifest of the new shards and those that were there, and remove the receipts."""
     # shards of earlier runs that this call does not touch stay in the data set
     earlier_shards = {file: shard.entry for file, shard in _find_finished(folder).items()}
@@ -403,7 +401,7 @@ def _finish(
         first = f"; first of {len(causes)} causes: {causes[0]}" if causes else ""
         raise DataError(f"not one scenario could be converted{first}")
     earlier = _earlier_manifest(folder)
-    note = license_note or source.license_note
+    note = note or source.license_note
     # of several sources every license applies
     note = earlier.license_note if note in earlier.license_note else f"{earlier.license_note} {note}".lstrip()
     provenance = {**earlier.provenance, **source.describe()}

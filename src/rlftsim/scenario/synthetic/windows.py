@@ -37,9 +37,7 @@ Size = tuple[float, float, float]
 """Length, width and height in meters."""
 
 
-def moves_plausibly(
-    position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], is_vehicle: bool = True
-) -> bool:
+def moves_plausibly(position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], is_vehicle: bool) -> bool:
     """True for a path within the limits of acceleration, for vehicles also within those of slip and turning per step.
 
     Args:
