@@ -133,14 +133,9 @@ def build_road_edges(features: MapFeatures, device: torch.device) -> RoadEdges |
         return None
     start, end, owner = _cut_segments(polylines)
     bounds = (np.minimum(start, end), np.maximum(start, end))
-    previous, following = _link_neighbors(polylines)
-    return RoadEdges(
-        segments=chunk_segments(start, end, owner, bounds, axis_scale=(1.0, 1.0, HEIGHT_STRETCH), device=device),
-        start=torch.from_numpy(start[:, :2].copy()).to(device),
-        delta=torch.from_numpy((end - start)[:, :2].copy()).to(device),
-        previous=torch.from_numpy(previous).to(device),
-        next=torch.from_numpy(following).to(device),
-    )
+    chunks = chunk_segments(start, end, owner, bounds, axis_scale=(1.0, 1.0, HEIGHT_STRETCH), device=device)
+    arrays = (start[:, :2].copy(), (end - start)[:, :2].copy(), *_link_neighbors(polylines))
+    return RoadEdges(chunks, *(torch.from_numpy(array).to(device) for array in arrays))
 
 
 def _measure_road_edge(
