@@ -300,6 +300,7 @@ def _measure(
         traffic_light_violation=violation,
         displacement_error=displacement,
         valid=valid,
+        repeat=1,
     )
 
 
