@@ -125,8 +125,7 @@ _STOP = (LightState.STOP, LightState.ARROW_STOP)
 _LIGHT_STATES = {
     "G": (LightState.GO, LightState.ARROW_GO),
     "g": (LightState.GO, LightState.GO),
-    "y": (LightState.CAUTION, LightState.ARROW_CAUTION),
-    "Y": (LightState.CAUTION, LightState.ARROW_CAUTION),
+    **dict.fromkeys("yY", (LightState.CAUTION, LightState.ARROW_CAUTION)),
 }
 """WOMD's states, without and with an arrow, for the letters of SUMO; all others mean stop."""
 
