@@ -5,7 +5,7 @@ import operator
 import os
 import re
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
@@ -174,9 +174,7 @@ def check_positive(config: object, names: tuple[str, ...]) -> None:
     Raises:
         ConfigError: one of them is not above zero; the message names it and its value.
     """
-    for name in names:
-        if not getattr(config, name) > 0:
-            raise ConfigError(f"{name} must be positive, got {getattr(config, name)}.")
+    _check_fields(config, names, lambda value: value > 0, "be positive")
 
 
 def check_not_negative(config: object, names: tuple[str, ...]) -> None:
@@ -189,9 +187,7 @@ def check_not_negative(config: object, names: tuple[str, ...]) -> None:
     Raises:
         ConfigError: one of them is negative or not a number; the message names it and its value.
     """
-    for name in names:
-        if not getattr(config, name) >= 0:
-            raise ConfigError(f"{name} must not be negative, got {getattr(config, name)}.")
+    _check_fields(config, names, lambda value: value >= 0, "not be negative")
 
 
 def check_finiteness(config: object, names: tuple[str, ...]) -> None:
@@ -204,9 +200,13 @@ def check_finiteness(config: object, names: tuple[str, ...]) -> None:
     Raises:
         ConfigError: one of them is infinite or not a number; the message names it and its value.
     """
+    _check_fields(config, names, math.isfinite, "be a finite number")
+
+
+def _check_fields(config: object, names: tuple[str, ...], is_fit: Callable[[Any], bool], rule: str) -> None:
     for name in names:
-        if not math.isfinite(getattr(config, name)):
-            raise ConfigError(f"{name} must be a finite number, got {getattr(config, name)}.")
+        if not is_fit(getattr(config, name)):
+            raise ConfigError(f"{name} must {rule}, got {getattr(config, name)}.")
 
 
 def check_limits(config: object, limits: Mapping[Any, int]) -> None:

@@ -40,7 +40,7 @@ def read(units, *names):
 
 def test_kinematics(units):
     x, y, z, heading, valid = read(units, "kin_x", "kin_y", "kin_z", "kin_heading", "kin_valid")
-    for name, values in compute_kinematics((x, y, z), heading)._asdict().items():
+    for name, values in compute_kinematics((x, y, z), heading).items():
         official = torch.from_numpy(units[f"kin_{name}"])
         torch.testing.assert_close(values, official, atol=1e-6, rtol=1e-6, equal_nan=True)
     assert (shrink_validity(valid).numpy() == units["kin_speed_valid"]).all()

@@ -111,13 +111,19 @@ class Features:
 
 
 @dataclass(frozen=True, eq=False)
-class ScenarioLog:
-    """Logged side of a scenario in the metric, on a device; holds no reference to the scenario."""
+class Surroundings:
+    """All that rollouts are measured against, of a scenario, or of several side by side, on a device."""
 
-    scenario_id: str
     agents: LoggedAgents
     road_edges: RoadEdges | None
     signals: Signals | None
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioLog(Surroundings):
+    """Logged side of a scenario in the metric, on a device; holds no reference to the scenario."""
+
+    scenario_id: str
     features: Features
     """Features of the log, N = 1."""
 
@@ -133,22 +139,19 @@ class ScenarioLog:
 
 
 @dataclass(frozen=True, eq=False)
-class JoinedLogs:
+class JoinedLogs(Surroundings):
     """The logs of several scenarios side by side: a device measures their rollouts in one go."""
 
     logs: tuple[ScenarioLog, ...]
-    agents: LoggedAgents
-    road_edges: RoadEdges | None
-    signals: Signals | None
 
     @classmethod
     def from_logs(cls, logs: Sequence[ScenarioLog]) -> "JoinedLogs":
         """Logs on the same device, side by side."""
         return cls(
-            tuple(logs),
             join_agents([log.agents for log in logs]),
             join_road_edges([log.road_edges for log in logs]),
             join_signals([log.signals for log in logs]),
+            tuple(logs),
         )
 
     @property
@@ -223,12 +226,12 @@ def _build_log(
             f"Scenario {scenario.scenario_id} has no road edge, so the distance to it is undefined: leave the scenario "
             'out, or pass missing_map="neutral" to count all agents as on the road.'
         )
-    signals = build_signals(scenario.map_features, scenario.lights, device)
+    scene = Surroundings(agents, road_edges, build_signals(scenario.map_features, scenario.lights, device))
     # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.
     log = Trajectories(*(values[None] for values in agents.trajectories))
     with torch.no_grad():
-        features = _measure(log, agents.size[None], agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
-    return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
+        features = _measure(scene, log, agents.size[None], is_log=True, max_pairs=max_pairs)
+    return ScenarioLog(**vars(scene), scenario_id=scenario.scenario_id, features=features)
 
 
 @torch.no_grad()
@@ -251,22 +254,15 @@ def compute_features(
     if len(histories) > 1:
         trajectories = join_trajectories([history for history, _ in histories])
         size = torch.cat([sizes for _, sizes in histories], 1)
-    max_pairs = compute.pairs_on(states[0].device)
-    features = _measure(trajectories, size, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
+    features = _measure(log, trajectories, size, is_log=False, max_pairs=compute.pairs_on(states[0].device))
     return replace(features, repeat=states[0].repeat)
 
 
 def _measure(
-    trajectories: Trajectories,
-    size: Float[Tensor, "#N A #T 3"],
-    agents: LoggedAgents,
-    road_edges: RoadEdges | None,
-    signals: Signals | None,
-    *,
-    is_log: bool,
-    max_pairs: int,
+    scene: Surroundings, trajectories: Trajectories, size: Float[Tensor, "#N A #T 3"], *, is_log: bool, max_pairs: int
 ) -> Features:
     """Features of trajectories [N, A, history + T] with a history that ends with the current step, if any."""
+    agents = scene.agents
     num_steps = agents.challenge.num_steps
     evaluated = trajectories.select_agents(agents.evaluated)  # [N, E, history + T]
     future = evaluated.from_step(-num_steps)  # [N, E, T]
@@ -278,16 +274,16 @@ def _measure(
     # 2. Other agents.
     # The log of a scene counts as present where it is not: what the file stores there is in the way of the others.
     masks_log = is_log and not agents.challenge.makes_scenes
-    nearest, time_to_collision = _compute_interaction(trajectories, size, agents, masks_log, max_pairs=max_pairs)
+    nearest, time_to_collision = _compute_interaction(agents, trajectories, size, masks_log, max_pairs)
     # 3. Traffic lights: a crossing at the first future step compares with the current step. A scene's first step has
     #    no step before, and none is crossed there.
     with_current = evaluated.from_step(-num_steps - 1)
     violation = torch.zeros_like(valid)
-    if signals is not None:
+    if scene.signals is not None:
         first_step = TOTAL_STEPS - with_current.x.shape[-1]
         violation = compute_traffic_light_violation(
-            with_current.x, with_current.y, valid[..., 1 - with_current.x.shape[-1] :], signals, first_step=first_step,
-            max_pairs=max_pairs, scenario=None if agents.layout is None else agents.layout.scenario,
+            with_current.x, with_current.y, valid[..., 1 - with_current.x.shape[-1] :], scene.signals,
+            first_step=first_step, max_pairs=max_pairs, scenario=agents.layout and agents.layout.scenario,
         )  # fmt: skip
         violation = F.pad(violation, (num_steps - violation.shape[-1], 0))
     # 4. Displacement from the log.
@@ -297,25 +293,19 @@ def _measure(
         logged = agents.trajectories.select_agents(agents.evaluated).from_step(-num_steps)
         displacement = compute_displacement_error(future, logged, agents.valid.index_select(0, agents.evaluated))
     return Features(
-        **{name: values[..., -num_steps:] for name, values in kinematics._asdict().items()},
+        **{name: values[..., -num_steps:] for name, values in kinematics.items()},
         distance_to_nearest_object=nearest,
         time_to_collision=time_to_collision,
-        distance_to_road_edge=_compute_road_edge(
-            future, size.index_select(1, agents.evaluated), agents, road_edges, valid, max_pairs
-        ),
+        distance_to_road_edge=_compute_road_edge(scene, future, size, valid, max_pairs),
         traffic_light_violation=violation,
         displacement_error=displacement,
         valid=valid,
+        repeat=1,
     )
 
 
 def _compute_interaction(
-    trajectories: Trajectories,
-    size: Float[Tensor, "#N A #T 3"],
-    agents: LoggedAgents,
-    masks_log: bool,
-    *,
-    max_pairs: int,
+    agents: LoggedAgents, trajectories: Trajectories, size: Float[Tensor, "#N A #T 3"], masks_log: bool, max_pairs: int
 ) -> tuple[Float[Tensor, "N E T"], Float[Tensor, "N E T"]]:
     """Distance to the nearest object and time to collision, some rollouts at a time."""
     num_steps = agents.challenge.num_steps
@@ -337,20 +327,21 @@ def _compute_interaction(
 
 
 def _compute_road_edge(
+    scene: Surroundings,
     future: Trajectories,
-    size: Float[Tensor, "#N E #T 3"],
-    agents: LoggedAgents,
-    edges: RoadEdges | None,
+    size: Float[Tensor, "#N A #T 3"],
     valid: Bool[Tensor, "N E T"],
     max_pairs: int,
 ) -> Float[Tensor, "N E T"]:
+    agents, edges = scene.agents, scene.road_edges
     if edges is None:
         return torch.full_like(future.x, INVALID_ROAD_EDGE_M)
     # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
     # the current position instead; their distance is overwritten below.
     current = agents.trajectories.select_agents(agents.evaluated)
     states = Trajectories(*(torch.where(valid, x, log[:, CURRENT_STEP, None]) for x, log in zip(future, current)))
-    scenario = None if agents.layout is None else agents.layout.scenario
+    scenario = agents.layout and agents.layout.scenario
+    size = size.index_select(1, agents.evaluated)
     distance = compute_distance_to_road_edge(states, size, edges, max_pairs=max_pairs, scenario=scenario)
     if scenario is not None and edges.has_edges is not None:
         valid = valid & edges.has_edges[scenario, None]

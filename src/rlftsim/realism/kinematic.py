@@ -8,8 +8,6 @@ Source: Waymo Open Sim Agents Challenge, evaluator of 2025. All values are float
     two.
 """
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,15 +16,6 @@ from rlftsim.geometry import wrap_angle
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.rounding import compute_sqrt
 from rlftsim.scenario.types import STEP_S
-
-
-class KinematicFeatures(NamedTuple):
-    """Kinematics of trajectories, [..., T] each: m/s, m/s² (signed), rad/s, rad/s²."""
-
-    linear_speed: Float[Tensor, "... T"]
-    linear_acceleration: Float[Tensor, "... T"]
-    angular_speed: Float[Tensor, "... T"]
-    angular_acceleration: Float[Tensor, "... T"]
 
 
 def compute_central_difference(values: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
@@ -44,8 +33,8 @@ def _compute_turn(angle: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
 def compute_kinematics(
     position: tuple[Float[Tensor, "... T"], Float[Tensor, "... T"], Float[Tensor, "... T"]],
     heading: Float[Tensor, "... T"],
-) -> KinematicFeatures:
-    """Linear and angular speed and acceleration of trajectories.
+) -> dict[str, Float[Tensor, "... T"]]:
+    """Linear and angular speed and acceleration of trajectories, m/s, m/s² (signed), rad/s, rad/s², by name.
 
     Args:
         position: x, y and z of the box center, m; the height counts, as officially.
@@ -55,12 +44,12 @@ def compute_kinematics(
     linear_speed = compute_sqrt(dx * dx + dy * dy + dz * dz) / STEP_S
     turn = _compute_turn(heading)
     # Angular acceleration wraps the difference of the turns once more; it is not the difference of the angular speeds.
-    return KinematicFeatures(
-        linear_speed=linear_speed,
-        linear_acceleration=compute_central_difference(linear_speed) / STEP_S,
-        angular_speed=turn / STEP_S,
-        angular_acceleration=_compute_turn(turn) / STEP_S**2,
-    )
+    return {
+        "linear_speed": linear_speed,
+        "linear_acceleration": compute_central_difference(linear_speed) / STEP_S,
+        "angular_speed": turn / STEP_S,
+        "angular_acceleration": _compute_turn(turn) / STEP_S**2,
+    }
 
 
 def compute_ground_speed(x: Float[Tensor, "... T"], y: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from rlftsim.geometry import box_corners
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.rounding import compute_sqrt
 from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment, join_chunks
@@ -132,14 +133,9 @@ def build_road_edges(features: MapFeatures, device: torch.device) -> RoadEdges |
         return None
     start, end, owner = _cut_segments(polylines)
     bounds = (np.minimum(start, end), np.maximum(start, end))
-    previous, following = _link_neighbors(polylines)
-    return RoadEdges(
-        segments=chunk_segments(start, end, owner, bounds, axis_scale=(1.0, 1.0, HEIGHT_STRETCH), device=device),
-        start=torch.from_numpy(start[:, :2].copy()).to(device),
-        delta=torch.from_numpy((end - start)[:, :2].copy()).to(device),
-        previous=torch.from_numpy(previous).to(device),
-        next=torch.from_numpy(following).to(device),
-    )
+    chunks = chunk_segments(start, end, owner, bounds, axis_scale=(1.0, 1.0, HEIGHT_STRETCH), device=device)
+    arrays = (start[:, :2].copy(), (end - start)[:, :2].copy(), *_link_neighbors(polylines))
+    return RoadEdges(chunks, *(torch.from_numpy(array).to(device) for array in arrays))
 
 
 def _measure_road_edge(
@@ -216,17 +212,13 @@ def compute_distance_to_road_edge(
         max_pairs: Bound on the point-segment pairs in memory; changes no result.
         scenario: Scenario of each agent, where the edges are those of several scenarios.
     """
-    half_length, half_width, half_height = (size / 2).unbind(-1)  # [E, 1] each
-    box_x = torch.stack([half_length, -half_length, -half_length, half_length], -1)  # [E, 1, 4]
-    box_y = torch.stack([half_width, half_width, -half_width, -half_width], -1)
-    cos, sin = agents.heading.cos()[..., None], agents.heading.sin()[..., None]
-    x = cos * box_x - sin * box_y + agents.x[..., None]  # [N, E, T, 4]
-    y = sin * box_x + cos * box_y + agents.y[..., None]
-    z = (agents.z - half_height)[..., None].expand_as(x)
-    corners = torch.stack([x, y, z], dim=-1)  # [N, E, T, 4, 3]
+    length, width, height = size.unbind(-1)  # [E, 1] each
+    planar = box_corners(torch.stack([agents.x, agents.y], -1), agents.heading, length, width)  # [N, E, T, 4, 2]
+    z = (agents.z - height / 2)[..., None].expand(planar.shape[:-1])
+    corners = torch.cat([planar, z[..., None]], -1)  # [N, E, T, 4, 3]
     # The corners of a few steps lie close together: they make a group.
     steps = math.gcd(corners.shape[2], GROUP_STEPS)
     groups = corners.view(*corners.shape[:2], -1, 4 * steps, 3)  # [N, E, T / steps, 4 steps, 3]
     scenario = None if scenario is None else scenario[:, None].expand(groups.shape[:3]).flatten()
     distance = compute_point_distance_to_road_edge(groups.flatten(0, 2), edges, max_pairs=max_pairs, scenario=scenario)
-    return distance.view(x.shape).amax(-1)
+    return distance.view(z.shape).amax(-1)

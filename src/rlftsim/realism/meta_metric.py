@@ -176,13 +176,12 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
         leave_one_out = torch.full_like(leave_one_out, torch.nan)
     # 3. Reported beside the metric, for each rollout [*B, N].
     displacement = _mean_per_rollout(features.displacement_error, log, repeat)
-    collision = _compute_rate(features.collision, log, repeat)
-    offroad = _compute_rate(features.offroad, log, repeat)
+    events = ("collision", "offroad", "traffic_light_violation")
+    rates = {name: _compute_rate(getattr(features, name), log, repeat) for name in events}
     stays_on_road = ~log.leaves_road  # [E]
     leaves_road = (features.offroad & log.agents.future_valid).any(-1) & stays_on_road  # [N, E]
     num_leaving = sum_over_agents(leaves_road.to(torch.float32), log.agents.layout).sum(0)  # [*B]
     num_staying = sum_over_agents(stays_on_road.to(torch.float32), log.agents.layout)
-    light = _compute_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
         tuple(scene.scenario_id for scene in log.logs),
         config,
@@ -190,16 +189,12 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
         *(_weigh(likelihoods[0], row) for row in weights),  # the meta-metric, then the sub-scores
         average_displacement_error=displacement.mean(-1),
         min_average_displacement_error=displacement.amin(-1),
-        collision_rate=collision.mean(-1),
-        offroad_rate=offroad.mean(-1),
+        **{f"{name}_rate": rate.mean(-1) for name, rate in rates.items()},
         unlogged_offroad_rate=num_leaving / (num_distinct * num_staying),
-        traffic_light_violation_rate=light.mean(-1),
         leave_one_out_meta_metric=leave_one_out,
         single_meta_metric=single,
         rollout_displacement_error=displacement,
-        rollout_collision_rate=collision,
-        rollout_offroad_rate=offroad,
-        rollout_traffic_light_violation_rate=light,
+        **{f"rollout_{name}_rate": rate for name, rate in rates.items()},
     )
 
 

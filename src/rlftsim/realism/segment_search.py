@@ -159,12 +159,6 @@ def _squared_box_distance(
     return functools.reduce(Tensor.add_, squares)
 
 
-def _to_key(distance: Float[Tensor, "P"], segment: Int64[Tensor, "P"]) -> Int64[Tensor, "P"]:
-    # The bits of a non-negative float32, read as an integer, are ordered like the number. So the minimum of one integer
-    # finds the smallest distance and, among equals, the lowest index.
-    return (distance.view(torch.int32).to(torch.int64) << _KEY_SHIFT) | segment
-
-
 def _squared_limit(key: Int64[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Squared box distance beyond which no chunk can win or tie; generous against float32 rounding."""
     distance = (key >> _KEY_SHIFT).to(torch.int32).view(torch.float32)
@@ -190,7 +184,10 @@ class _Search:
             distance = compute_sqrt(squared.amin(-1))
             # Ties are between distances, not their squares: rounding the root makes more of them equal.
             slot = (squared <= compute_largest_square(distance)[:, None]).to(torch.uint8).argmax(-1)
-            keys.append(_to_key(distance, chunk * CHUNK_SEGMENTS + slot))
+            # The bits of a non-negative float32, read as an integer, are ordered like the number. So the minimum of one
+            # integer finds the smallest distance and, among equals, the lowest index.
+            bits = distance.view(torch.int32).to(torch.int64)
+            keys.append((bits << _KEY_SHIFT) | (chunk * CHUNK_SEGMENTS + slot))
         return keys[0] if len(keys) == 1 else torch.cat(keys)
 
     def widen(

@@ -20,6 +20,7 @@ import inspect
 import keyword
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakSet
 
@@ -56,14 +57,7 @@ def register_reward(name: str) -> Callable[[Function], Function]:
         ConfigError: The name is that of a shipped reward, or does not fit into a sum of rewards; or the function does
             not take the arguments that a reward is called with.
     """
-    _check_name(name)
-
-    def register(function: Function) -> Function:
-        check_signature(name, function)
-        REWARDS.add(name, function, stacklevel=3)
-        return function
-
-    return register
+    return _register(name, partial(check_signature, name))
 
 
 def register_sum(name: str) -> Callable[[Function], Function]:
@@ -72,10 +66,15 @@ def register_sum(name: str) -> Callable[[Function], Function]:
     Raises:
         ConfigError: The name is that of a shipped reward, or does not fit into a sum of rewards.
     """
+    return _register(name, _SUMS.add)
+
+
+def _register(name: str, prepare: Callable[[Function], object]) -> Callable[[Function], Function]:
+    """Decorator that adds a function to `REWARDS` once it is prepared."""
     _check_name(name)
 
     def register(function: Function) -> Function:
-        _SUMS.add(function)
+        prepare(function)
         REWARDS.add(name, function, stacklevel=3)
         return function
 

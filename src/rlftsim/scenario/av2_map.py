@@ -30,21 +30,17 @@ LANE_TYPES = {
     "BIKE": MapFeatureType.LANE_BIKE,
 }
 LINE_TYPES = {
-    "NONE": None,
-    "UNKNOWN": None,
-    "DASHED_WHITE": MapFeatureType.LINE_BROKEN_SINGLE_WHITE,
-    "DOUBLE_DASH_WHITE": MapFeatureType.LINE_BROKEN_SINGLE_WHITE,
-    "SOLID_WHITE": MapFeatureType.LINE_SOLID_SINGLE_WHITE,
-    "SOLID_BLUE": MapFeatureType.LINE_SOLID_SINGLE_WHITE,
-    "DOUBLE_SOLID_WHITE": MapFeatureType.LINE_SOLID_DOUBLE_WHITE,
-    "SOLID_DASH_WHITE": MapFeatureType.LINE_SOLID_DOUBLE_WHITE,
-    "DASH_SOLID_WHITE": MapFeatureType.LINE_SOLID_DOUBLE_WHITE,
+    **dict.fromkeys(("NONE", "UNKNOWN")),
+    **dict.fromkeys(("DASHED_WHITE", "DOUBLE_DASH_WHITE"), MapFeatureType.LINE_BROKEN_SINGLE_WHITE),
+    **dict.fromkeys(("SOLID_WHITE", "SOLID_BLUE"), MapFeatureType.LINE_SOLID_SINGLE_WHITE),
+    **dict.fromkeys(
+        ("DOUBLE_SOLID_WHITE", "SOLID_DASH_WHITE", "DASH_SOLID_WHITE"), MapFeatureType.LINE_SOLID_DOUBLE_WHITE
+    ),
     "DASHED_YELLOW": MapFeatureType.LINE_BROKEN_SINGLE_YELLOW,
     "DOUBLE_DASH_YELLOW": MapFeatureType.LINE_BROKEN_DOUBLE_YELLOW,
     "SOLID_YELLOW": MapFeatureType.LINE_SOLID_SINGLE_YELLOW,
     "DOUBLE_SOLID_YELLOW": MapFeatureType.LINE_SOLID_DOUBLE_YELLOW,
-    "SOLID_DASH_YELLOW": MapFeatureType.LINE_PASSING_DOUBLE_YELLOW,
-    "DASH_SOLID_YELLOW": MapFeatureType.LINE_PASSING_DOUBLE_YELLOW,
+    **dict.fromkeys(("SOLID_DASH_YELLOW", "DASH_SOLID_YELLOW"), MapFeatureType.LINE_PASSING_DOUBLE_YELLOW),
 }
 """Lane mark -> road line; None = no line."""
 INSTALL_HINT = 'Argoverse 2 maps need shapely: pip install "rlftsim[av2]"'

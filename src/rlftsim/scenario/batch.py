@@ -150,9 +150,8 @@ def _agent_rows(
     }
 
 
-def _pad(array: np.ndarray, rows: int, columns: int | None = None) -> np.ndarray:
-    """Zeros appended along the first axis, and along the second where `columns` is given."""
-    shape = (rows, *array.shape[1:]) if columns is None else (rows, columns, *array.shape[2:])
-    padded = np.zeros(shape, array.dtype)
+def _pad(array: np.ndarray, *lengths: int) -> np.ndarray:
+    """Zeros appended along the first axes, up to their new lengths."""
+    padded = np.zeros((*lengths, *array.shape[len(lengths) :]), array.dtype)
     padded[tuple(slice(0, n) for n in array.shape)] = array
     return padded

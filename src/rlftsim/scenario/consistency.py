@@ -5,7 +5,7 @@ detections are noisy; a scenario does where more than half of the moving tracks 
 """
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -23,6 +23,7 @@ SPEED_TOLERANCE_MPS, SPEED_TOLERANCE = 1.0, 0.3
 TYPES_WITH_FRONT = (ObjectType.VEHICLE, ObjectType.CYCLIST)
 DRIVING_MPS = 3.0
 """Vehicles and cyclists that are faster face the way they move; slower ones may back up, and pedestrians step aside."""
+MOVERS, DRIVERS = "moving tracks", f"vehicles and cyclists faster than {DRIVING_MPS:g} m/s"
 MAX_ASKEW_DEG = 20.0
 """Between heading and motion, median over a track. Of 4 589 real tracks faster than 2 m/s 3 are beyond, of 2 374
 synthetic ones none; the median track of each of their scenarios is at most 8.1 degrees off. Of 515 paths that
@@ -69,40 +70,41 @@ def describe_contradictions(
     if 2 * len(contrary) > num_judged:
         track = contrary[0]
         steps = is_moving[track] & is_off[track]
-        medians = (float(np.median(speed[track, steps])) for speed in (moved_mps, said_mps, off_mps))
-        by_position, by_velocity, difference = medians
-        texts.append(
-            f"velocities contradict the change of positions in {len(contrary)} of {num_judged} moving tracks: track "
-            f"{tracks.object_id[track]} moves at {by_position:.1f} m/s, its velocity is {by_velocity:.1f} m/s and "
-            f"{difference:.1f} m/s off"
-        )
+        position, velocity, off = (float(np.median(speed[track, steps])) for speed in (moved_mps, said_mps, off_mps))
+        motion = f"moves at {position:.1f} m/s, its velocity is {velocity:.1f} m/s and {off:.1f} m/s off"
+        conflict = "velocities contradict the change of positions in"
+        texts.append(_describe(conflict, contrary, num_judged, MOVERS, tracks, motion))
     contrary, num_judged = find_contrary(is_driving, is_askew)
     if 2 * len(contrary) > num_judged:
-        texts.append(
-            f"headings contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
-            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[contrary[0]]} faces more than {MAX_ASKEW_DEG:g} degrees "
-            "away from it"
-        )
-    elif 2 * len(backing := find_backing(tracks)) > num_judged > 1:
-        texts.append(
-            f"headings contradict the motion of {len(backing)} of {num_judged} vehicles and cyclists faster than "
-            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[backing[0][0]]} backs up for more than {BACKING_S:g} s"
-        )
+        motion = f"faces more than {MAX_ASKEW_DEG:g} degrees away from it"
+        texts.append(_describe("headings contradict the motion of", contrary, num_judged, DRIVERS, tracks, motion))
+    elif 2 * len(backing := [track for track, _ in find_backing(tracks)]) > num_judged > 1:
+        motion = f"backs up for more than {BACKING_S:g} s"
+        texts.append(_describe("headings contradict the motion of", backing, num_judged, DRIVERS, tracks, motion))
     texts += _describe_jumps("positions", "moves", np.where(is_observed, moved_mps * STEP_S, 0.0), MAX_JUMP_M, tracks)
     if "z" in guessed:
         return "; ".join(texts)
     contrary, num_judged = find_contrary(is_driving, climb_mps > moved_mps)
     if 2 * len(contrary) > num_judged:
-        track = contrary[0]
-        texts.append(
-            f"heights contradict the motion of {len(contrary)} of {num_judged} vehicles and cyclists faster than "
-            f"{DRIVING_MPS:g} m/s: track {tracks.object_id[track]} climbs or falls at "
-            f"{float(np.median(climb_mps[track, is_driving[track]])):.1f} m/s, more than 45 degrees"
-        )
+        median_mps = float(np.median(climb_mps[contrary[0], is_driving[contrary[0]]]))
+        motion = f"climbs or falls at {median_mps:.1f} m/s, more than 45 degrees"
+        texts.append(_describe("heights contradict the motion of", contrary, num_judged, DRIVERS, tracks, motion))
     climb_m = np.where(is_observed, climb_mps * STEP_S, 0.0)
     texts += _describe_jumps("heights (z)", "climbs or falls by", climb_m, MAX_CLIMB_M, tracks)
     texts += _describe_heights(tracks, map_features, is_moving)
     return "; ".join(texts)
+
+
+def _describe(
+    conflict: str,
+    contrary: Sequence[int] | Int64[np.ndarray, "n"],
+    num_judged: int,
+    group: str,
+    tracks: Tracks,
+    cause: str,
+) -> str:
+    """Conflict of most tracks of a group, with what the first of them does."""
+    return f"{conflict} {len(contrary)} of {num_judged} {group}: track {tracks.object_id[contrary[0]]} {cause}"
 
 
 def find_backing(tracks: Tracks) -> list[tuple[int, int]]:
@@ -161,10 +163,8 @@ def _describe_heights(
         track = contrary[0]
         first = position[track, is_off[track].argmax()]
         height = points[KDTree(points[:, :2]).query(first[:2])[1], 2]
-        yield (
-            f"heights (z) contradict the map near {len(contrary)} of {num_judged} moving tracks: track "
-            f"{tracks.object_id[track]} is at {first[2]:.1f} m, the map there at {height:.1f} m"
-        )
+        position = f"is at {first[2]:.1f} m, the map there at {height:.1f} m"
+        yield _describe("heights (z) contradict the map near", contrary, num_judged, MOVERS, tracks, position)
 
 
 def _sample_points(map_features: MapFeatures) -> Float[np.ndarray, "n 3"]:

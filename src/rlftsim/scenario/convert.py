@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import TypeAlias
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
@@ -96,11 +97,8 @@ class _FinishedShard:
         return {name: self.settings.get(name) for name in names}
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    entry: ShardEntry
-    is_reused: bool | None
-    """None for a shard that another share has taken over or made."""
+_Outcome: TypeAlias = tuple[ShardEntry, bool | None]
+"""A finished shard, and True if it is reused; None for a shard that another share has taken over or made."""
 
 
 class _Stopped(Exception):
@@ -150,7 +148,7 @@ class _Shards(ResultFormat[_Task, _Outcome]):
                 f"{self._folder / item.shard} was converted with other options "
                 f"({_describe_difference(stored, self._settings)}): give all shares the same, or another destination."
             )
-        return _Outcome(shard.entry, None) if item.agrees(shard.entry) else None
+        return (shard.entry, None) if item.agrees(shard.entry) else None
 
 
 def convert(
@@ -241,11 +239,11 @@ def convert(
             partial(_convert_unit, source=data_source),
             format=_Shards(folder, data_source), lease=lease, runner=runner, unit="bytes", show_progress=show_progress,
         )  # fmt: skip
-        num_changed = sum(not task.agrees(outcome.entry) for task, outcome in zip(tasks, outcomes))
+        num_changed = sum(not task.agrees(entry) for task, (entry, _) in zip(tasks, outcomes))
         check_finished(runner, num_changed, len(tasks), "convert")  # sources that changed meanwhile
         remove_temporaries(outputs)  # of processes that were killed
         earlier = _earlier_manifest(folder)
-        manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note, lease)
+        manifest = _finish(folder, [entry for entry, _ in outcomes], data_source, license_note, lease)
         lease.remove()
     return _report(folder, outcomes, manifest, earlier.duplicates)
 
@@ -310,12 +308,11 @@ def _convert_unit(
     # 1. Take over the shard of an earlier run if it is whole and made from these very files; remote ones are compared
     # by size alone, as their checksums would take as long as fetching them.
     settings = _plain(source.describe())
-    has_settings = task.finished is not None and task.finished.select_settings(settings) == settings
-    stored = task.finished.entry if task.finished is not None and has_settings else None
+    stored = task.finished.entry if task.finished and task.finished.select_settings(settings) == settings else None
     if task.unit.url:
         if stored is not None and task.agrees(stored) and hash_file(task.folder / task.shard) == stored.sha256:
             advance(task.unit.size)
-            return _Outcome(stored, is_reused=True)
+            return stored, True
         with tempfile.TemporaryDirectory() as folder:
             local = Path(folder) / Path(task.unit.url).name
             fetch(task.unit.url, local)
@@ -329,7 +326,7 @@ def _convert_unit(
         and hash_file(task.folder / task.shard) == stored.sha256
     ):
         advance(size)
-        return _Outcome(stored, is_reused=True)
+        return stored, True
 
     # 2. Read and write record by record, so that memory does not grow with the file.
     skipped: list[SkippedRecord] = []
@@ -368,7 +365,7 @@ def _convert_unit(
     )
     receipt = {**asdict(entry), "settings": settings, "schema_version": SCHEMA_VERSION}
     write_json(task.folder / f"{task.shard}.json", receipt)
-    return _Outcome(entry, is_reused=False)
+    return entry, False
 
 
 def _fingerprint(files: tuple[Path, ...], settings: Mapping[str, object]) -> tuple[int, str]:
@@ -383,9 +380,7 @@ def _fingerprint(files: tuple[Path, ...], settings: Mapping[str, object]) -> tup
     return size, digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-def _finish(
-    folder: Path, new: list[ShardEntry], source: DataSource, license_note: str | None, lease: Lease
-) -> Manifest:
+def _finish(folder: Path, new: list[ShardEntry], source: DataSource, note: str | None, lease: Lease) -> Manifest:
     """Write index and manifest of the new shards and those that were there, and remove the receipts."""
     # shards of earlier runs that this call does not touch stay in the data set
     earlier_shards = {file: shard.entry for file, shard in _find_finished(folder).items()}
@@ -403,7 +398,7 @@ def _finish(
         first = f"; first of {len(causes)} causes: {causes[0]}" if causes else ""
         raise DataError(f"not one scenario could be converted{first}")
     earlier = _earlier_manifest(folder)
-    note = license_note or source.license_note
+    note = note or source.license_note
     # of several sources every license applies
     note = earlier.license_note if note in earlier.license_note else f"{earlier.license_note} {note}".lstrip()
     provenance = {**earlier.provenance, **source.describe()}
@@ -418,7 +413,7 @@ def _report(
     folder: Path, outcomes: list[_Outcome], manifest: Manifest, earlier_duplicates: Sequence[SkippedRecord]
 ) -> ConvertReport:
     """Report on the units of this call; a data set may hold more, and other shares may have made most of them."""
-    entries = [outcome.entry for outcome in outcomes]
+    entries = [entry for entry, _ in outcomes]
     all_names = names_of_shards(manifest.shards)
     names = {all_names[entry.file] for entry in entries}
     duplicates = [record for record in manifest.duplicates if record.file in names]
@@ -433,8 +428,8 @@ def _report(
         converted=sum(entry.num_rows for entry in entries) - len(duplicates),
         skipped=tuple(record for entry in entries for record in entry.skipped),
         duplicates=(*duplicates, *replaced),
-        shards_written=sum(outcome.is_reused is False for outcome in outcomes),
-        shards_reused=sum(outcome.is_reused is True for outcome in outcomes),
+        shards_written=sum(is_reused is False for _, is_reused in outcomes),
+        shards_reused=sum(is_reused is True for _, is_reused in outcomes),
         counts=manifest.counts,
         tallies=dict(sorted(tallies.items())),
     )

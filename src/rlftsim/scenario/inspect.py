@@ -160,9 +160,7 @@ def dataset_stats(folder: str | os.PathLike[str], *, split: str | None = None) -
     total_rows = max(sum(entry.num_rows for entry in dataset.manifest.shards), 1)
     return DatasetStats(
         num_scenarios=len(dataset),
-        by_split=_count(index["split"].to_pylist()),
-        by_num_steps=_count(index["num_steps"].to_pylist()),
-        by_ego_maneuver=_count(index["ego_maneuver"].to_pylist()),
+        **{f"by_{name}": _count(index[name].to_pylist()) for name in ("split", "num_steps", "ego_maneuver", "source")},
         agents_by_type=agents,
         mean_agents=sum(agents.values()) / num_scenarios,
         mean_evaluated=sum(index["num_evaluated"].to_pylist()) / num_scenarios,
@@ -171,7 +169,6 @@ def dataset_stats(folder: str | os.PathLike[str], *, split: str | None = None) -
         kilobytes_per_scenario=total_bytes / total_rows / 1000.0,
         speeds=_compute_speeds(dataset, positions),
         num_speed_scenarios=len(positions),
-        by_source=_count(index["source"].to_pylist()),
         by_guessed=_count([word for words in index["guessed"].to_pylist() for word in words.split()]),
     )
 

@@ -330,8 +330,5 @@ def _from_arrays(plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray | Non
         tracks=Tracks(**groups["tracks"]),
         map_features=MapFeatures(**groups["map"], topology=LaneTopology(**groups["topology"])),
         lights=LightStates(**groups["lights"]),
-        scenario_id=plain["scenario_id"],
-        ego_index=plain["ego_index"],
-        source=plain["source"],
-        guessed=frozenset(plain["guessed"].split()),
+        **{**plain, "guessed": frozenset(plain["guessed"].split())},
     )

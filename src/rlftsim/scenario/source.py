@@ -154,8 +154,5 @@ def units_of_urls(sizes: Mapping[str, int]) -> list[Unit]:
 
 def infer_split(path: Path) -> str:
     """Split by the name of a file or else of the folder: training, validation, testing or unknown."""
-    for name in (path.name, path.absolute().parent.name):
-        match = _SPLIT.search(name)
-        if match:
-            return match.group()
-    return "unknown"
+    match = _SPLIT.search(path.name) or _SPLIT.search(path.absolute().parent.name)
+    return match.group() if match else "unknown"

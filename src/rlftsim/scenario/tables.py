@@ -11,6 +11,7 @@ A scenario that breaks the contract is left out with the table, the row and the 
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -111,10 +112,9 @@ class TablesSource:
                 continue  # `read` reports the damage
         licenses = list(dict.fromkeys(note for note in notes if note))
         self.license_note = " ".join(licenses) or type(self).license_note
-        folders = units_of_files([file.parent for file in tracks])
         return [
-            Unit(unit.name, tuple(p for p in map(unit.files[0].joinpath, _SCHEMAS) if p.exists()), unit.split)
-            for unit in folders
+            replace(unit, files=tuple(file for file in map(unit.files[0].joinpath, _SCHEMAS) if file.exists()))
+            for unit in units_of_files([file.parent for file in tracks])
         ]
 
     def read(self, unit: Unit) -> Iterator[Item]:

@@ -62,21 +62,18 @@ def clean_tracks(batch: ScenarioBatch, *, catk_compat: bool = False) -> CleanTra
         batch: Scenarios with the logged tracks of all agents.
         catk_compat: True = round where the public code rounds, by the rules of `tokens.catk_compat`.
     """
-    position, heading, velocity, valid = _fill_gaps(batch.position, batch.heading, batch.velocity, batch.valid)
+    tracks = _fill_gaps(batch)
     if catk_compat:
         position, velocity, valid = catk_ops.fill_gaps_in_world(batch)
-    heading = _hold_jumping_headings(heading, valid)
-    return _extend_backwards(CleanTracks(position, heading, velocity, valid), stepwise=catk_compat)
+        tracks = CleanTracks(position, tracks.heading, velocity, valid)
+    heading = _hold_jumping_headings(tracks.heading, tracks.valid)
+    return _extend_backwards(replace(tracks, heading=heading), stepwise=catk_compat)
 
 
-def _fill_gaps(
-    position: Float[Tensor, "B A S 2"],
-    heading: Float[Tensor, "B A S"],
-    velocity: Float[Tensor, "B A S 2"],
-    valid: Bool[Tensor, "B A S"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _fill_gaps(batch: ScenarioBatch) -> CleanTracks:
     """Linear interpolation between the first and the last valid step, which makes all steps between valid."""
     # 1. Last valid step at or before each step, and first one at or after it [B, A, S].
+    heading, valid = batch.heading, batch.valid
     steps = torch.arange(valid.shape[-1], device=valid.device).expand_as(valid)
     previous = torch.where(valid, steps, -1).cummax(-1).values
     following = torch.where(valid, steps, valid.shape[-1]).flip(-1).cummin(-1).values.flip(-1)
@@ -93,7 +90,8 @@ def _fill_gaps(
     # 3. Headings turn the short way round.
     turn = wrap_angle(heading.gather(-1, following) - heading.gather(-1, previous))
     heading = torch.where(valid, heading, wrap_angle(heading.gather(-1, previous) + weight * turn))
-    return blend(position), torch.where(is_inside, heading, 0.0), blend(velocity), is_inside
+    heading = torch.where(is_inside, heading, 0.0)
+    return CleanTracks(blend(batch.position), heading, blend(batch.velocity), is_inside)
 
 
 def _take_steps(values: Float[Tensor, "B A S c"], steps: Int64[Tensor, "B A S"]) -> Float[Tensor, "B A S c"]:

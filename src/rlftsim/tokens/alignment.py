@@ -9,9 +9,7 @@ from collections.abc import Collection
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
-from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STILL_TOKEN, Vocabulary
@@ -46,7 +44,10 @@ def align_vocabulary(vocabulary: Vocabulary, model_vocabulary: Vocabulary, *, ke
                 f"{len(tokens)} {name} tokens do not fit into the {model_vocabulary.num_tokens} places of the model: "
                 "build a smaller vocabulary, such as with --tokens.num-tokens."
             )
-        distance = _compute_distances(tokens, model_vocabulary.corners[index])  # [n, V]
+        # Mean distance of the boxes' corners over steps 1..5, m, in float64 [n, V]. A row at a time: all pairs of 1024
+        # tokens would take 300 MB.
+        table = model_vocabulary.corners[index, :, 1:]
+        distance = torch.stack([(token[1:] - table).double().norm(dim=-1).mean((1, 2)) for token in tokens])
         # Indices without a token come last: their weights were never trained.
         distance[:, ~model_vocabulary.token_mask[index]] += 1.0 + distance.max()
         distance[:, STILL_TOKEN] += 1e6
@@ -57,9 +58,3 @@ def align_vocabulary(vocabulary: Vocabulary, model_vocabulary: Vocabulary, *, ke
     sources = ", ".join((*(f"{name} tokens" for name in keep), "map pieces"))
     origin = f"{vocabulary.origin}; in the places of, and {sources} from: {model_vocabulary.origin}"
     return replace(model_vocabulary, corners=corners, token_mask=mask, origin=origin)
-
-
-def _compute_distances(tokens: Float[Tensor, "n 6 4 2"], table: Float[Tensor, "V 6 4 2"]) -> Float[Tensor, "n V"]:
-    """Mean distance of the boxes' corners over steps 1..5, m, in float64."""
-    # a row at a time: all pairs of 1024 tokens would take 300 MB
-    return torch.stack([(token[1:] - table[:, 1:]).double().norm(dim=-1).mean((1, 2)) for token in tokens])

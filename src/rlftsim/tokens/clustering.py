@@ -95,21 +95,21 @@ def build_vocabulary(
     if not len(scenarios):
         raise DataError("no scenario to build a vocabulary from: is the data set empty, or the split misspelt?")
     # 1. Motions and map windows of the sampled scenarios, in bounded memory.
-    data = _TokenData.collect(scenarios, config, show_progress)
-    if not data.num_motions:
+    samples, cells, windows = _collect_motions(scenarios, config, show_progress)
+    if not any(sample.num_rows for sample in samples):
         raise DataError("no track moves for half a second in these scenarios: nothing to build a vocabulary from.")
     # 2. Tokens of each class [V, 6, 4, 2], then map prototypes [P, 11, 2].
     tables, radii = [], []
     with progress_bar("tokens: make classes and map pieces", len(CLASS_NAMES) + 1, show=show_progress) as advance:
-        for index in range(len(CLASS_NAMES)):
-            tokens, radius = _build_motion_tokens(data, index, config)
+        for index, name in enumerate(CLASS_NAMES):
+            tokens, radius = _build_motion_tokens(samples[index], cells[index], index, config)
             tables.append(boxes(tokens, index))
             radii.append(radius)
-            advance(note=f"{CLASS_NAMES[index]}: {len(tokens)} tokens")
-        windows = data.windows.rows()
+            advance(note=f"{name}: {len(tokens)} tokens")
         # The classes have seeds [seed, 0..2], the map [seed, 3].
         rng = np.random.default_rng([config.seed, len(CLASS_NAMES)])
-        prototypes = cluster_windows(windows, limit=config.num_map_prototypes, coverage=config.coverage, rng=rng)
+        limit, coverage = config.num_map_prototypes, config.coverage
+        prototypes = cluster_windows(windows.rows(), limit=limit, coverage=coverage, rng=rng)
         advance(note=f"{len(prototypes)} map pieces")
     # 3. Classes with fewer tokens are padded with zeros.
     width = config.num_tokens if config.kind == "kdisks" else max(map(len, tables))
@@ -120,47 +120,34 @@ def build_vocabulary(
     return Vocabulary(corners, exists, torch.from_numpy(prototypes), origin), tuple(radii)
 
 
-@dataclass(frozen=True, eq=False)
-class _TokenData:
-    """Motions and map windows that tokens are made from."""
-
-    samples: tuple[DistinctSample, ...]
-    cells: tuple[GridMotions, ...]
-    windows: DistinctSample
-
-    @property
-    def num_motions(self) -> int:
-        """Number of motions of all classes."""
-        return sum(sample.num_rows for sample in self.samples)
-
-    @classmethod
-    def collect(cls, scenarios: Scenarios, config: TokensConfig, show_progress: bool) -> "_TokenData":
-        """Motions and windows of a sample of the scenarios."""
-        samples = tuple(DistinctSample(config.max_segments, config.seed) for _ in CLASS_NAMES)
-        cells = tuple(GridMotions(grid) for grid in config.trajtok.grids)
-        windows = DistinctSample(config.max_segments, config.seed)
-        positions = sample_scenarios(len(scenarios), config.max_scenarios, config.seed)
-        with progress_bar("tokens: read", len(positions), show=show_progress) as advance:
-            for position in positions:
-                scenario = scenarios[position]
-                motions = extract_motions(scenario)
-                for index, (sample, grid) in enumerate(zip(samples, cells)):
-                    class_motions = motions.select_class(index)
-                    sample.add(class_motions, motion_keys(class_motions))
-                    grid.add(class_motions)
-                map_windows = split_map(scenario).windows
-                windows.add(map_windows, window_keys(map_windows))
-                advance()
-        return cls(samples, cells, windows)
+def _collect_motions(
+    scenarios: Scenarios, config: TokensConfig, show_progress: bool
+) -> tuple[list[DistinctSample], list[GridMotions], DistinctSample]:
+    """Motions of each class, distinct and by cell of the grid, and map windows, of a sample of the scenarios."""
+    *samples, windows = (DistinctSample(config.max_segments, config.seed) for _ in (*CLASS_NAMES, "map"))
+    cells = [GridMotions(grid) for grid in config.trajtok.grids]
+    positions = sample_scenarios(len(scenarios), config.max_scenarios, config.seed)
+    with progress_bar("tokens: read", len(positions), show=show_progress) as advance:
+        for position in positions:
+            scenario = scenarios[position]
+            motions = extract_motions(scenario)
+            for index, (sample, grid) in enumerate(zip(samples, cells)):
+                class_motions = motions.select_class(index)
+                sample.add(class_motions, motion_keys(class_motions))
+                grid.add(class_motions)
+            map_windows = split_map(scenario).windows
+            windows.add(map_windows, window_keys(map_windows))
+            advance()
+    return samples, cells, windows
 
 
 def _build_motion_tokens(
-    data: _TokenData, index: int, config: TokensConfig
+    sample: DistinctSample, cells: GridMotions, index: int, config: TokensConfig
 ) -> tuple[Float32[np.ndarray, "V 6 3"], float | None]:
     """Tokens of a class, the first exactly still, and the radius of the disks."""
     if config.kind == "trajtok":
-        return rule_tokens(data.cells[index], config.trajtok), None
-    motions = data.samples[index].rows()
+        return rule_tokens(cells, config.trajtok), None
+    motions = sample.rows()
     # The data have few fast vehicles: without straight tokens of their own these would have no near token.
     straight = _fill_speed_gaps(motions, config) if index == 0 and len(motions) else motions[:0]
     tokens, radius = cluster_motions(

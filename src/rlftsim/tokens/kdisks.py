@@ -90,9 +90,7 @@ def cluster_motions(
         return _STILL, 0.0
     cloud = _motion_cloud(motions, class_index, mirror)
     motions = with_mirror_images(motions) if mirror else motions
-    order = rng.permutation(len(motions))
-    radius = smallest_radius(cloud, order, coverage=coverage, limit=limit)
-    disks, _ = lay_disks(cloud, order, radius, limit)
+    disks, radius = cover_shapes(cloud, coverage=coverage, limit=limit, rng=rng)
     tokens = [_STILL]
     for disk in disks[1:]:
         token = mean_motion(motions[disk.members])[None]
@@ -119,28 +117,27 @@ def cluster_windows(
     if not len(windows):
         return straight[None]
     cloud = Cloud(windows, straight)
-    order = rng.permutation(len(windows))
-    radius = smallest_radius(cloud, order, coverage=coverage, limit=limit)
-    disks, _ = lay_disks(cloud, order, radius, limit)
+    disks, _ = cover_shapes(cloud, coverage=coverage, limit=limit, rng=rng)
     return np.stack([straight, *[windows[disk.members].mean(0) for disk in disks[1:]]]).astype(np.float32)
 
 
-def smallest_radius(cloud: Cloud, order: Int64[np.ndarray, "n"], *, coverage: float, limit: int) -> float:
-    """Smallest radius at which `limit` disks cover a fraction of the shapes, to about 4 %, m.
+def cover_shapes(cloud: Cloud, *, coverage: float, limit: int, rng: np.random.Generator) -> tuple[list[Disk], float]:
+    """Disks of the smallest radius at which they cover a fraction of the shapes, and the radius, to about 4 %, m.
 
     Args:
         cloud: Shapes to cover, with mirror images if there are any.
-        order: Order in which the shapes become centers.
         coverage: Fraction of the shapes that lie within a disk.
         limit: Greatest number of tokens; a pair of disks counts twice.
+        rng: Generator of the order in which shapes become centers of disks.
     """
+    order = rng.permutation(len(cloud.shapes))
     # Bisection of the logarithm: coverage grows with the radius, up to noise from the order.
     low, high = MIN_RADIUS_M, MAX_RADIUS_M
     for _ in range(RADIUS_STEPS):
         middle = float(np.sqrt(low * high))
         is_uncovered = lay_disks(cloud, order, middle, limit)[1]
         low, high = (low, middle) if is_uncovered.mean() <= 1 - coverage else (middle, high)
-    return high
+    return lay_disks(cloud, order, high, limit)[0], high
 
 
 def lay_disks(

@@ -38,14 +38,9 @@ _FEATURE_TO_TYPE |= {5: 8, 6: 6, 7: 7, 8: 8, 9: 6, 10: 6, 11: 7, 12: 8, 13: 8}
 STOP_SIGN_LANE_TYPE = 2
 _STATE_TO_LIGHT = {
     LightState.UNKNOWN: 1,
-    LightState.ARROW_STOP: 2,
-    LightState.STOP: 2,
-    LightState.FLASHING_STOP: 2,
-    LightState.ARROW_GO: 3,
-    LightState.GO: 3,
-    LightState.ARROW_CAUTION: 4,
-    LightState.CAUTION: 4,
-    LightState.FLASHING_CAUTION: 4,
+    **dict.fromkeys((LightState.ARROW_STOP, LightState.STOP, LightState.FLASHING_STOP), 2),
+    **dict.fromkeys((LightState.ARROW_GO, LightState.GO), 3),
+    **dict.fromkeys((LightState.ARROW_CAUTION, LightState.CAUTION, LightState.FLASHING_CAUTION), 4),
 }
 
 

@@ -26,25 +26,25 @@ def test_overlap_counts_only_steps_at_which_both_are_valid():
 
 
 def test_constant_speed_passes():
-    assert moves_plausibly(along_x(np.full(30, 10.0)), np.zeros(30))
+    assert moves_plausibly(along_x(np.full(30, 10.0)), np.zeros(30), is_vehicle=True)
 
 
 def test_a_jump_of_position_is_refused():
     path = along_x(np.full(30, 10.0))
     path[15:, 0] += 0.5  # 0.5 m within one step is 50 m/s^2
-    assert not moves_plausibly(path, np.zeros(30))
+    assert not moves_plausibly(path, np.zeros(30), is_vehicle=True)
 
 
 def test_sliding_sideways_is_refused_for_vehicles_only():
     path = along_x(np.full(30, 10.0))
     sideways = np.full(30, 0.5)
-    assert not moves_plausibly(path, sideways)
+    assert not moves_plausibly(path, sideways, is_vehicle=True)
     assert moves_plausibly(path, sideways, is_vehicle=False)
 
 
 def test_a_jump_of_heading_is_refused():
     heading = np.where(np.arange(30) < 15, 0.0, 0.35)
-    assert not moves_plausibly(np.zeros((30, 2)), heading)
+    assert not moves_plausibly(np.zeros((30, 2)), heading, is_vehicle=True)
 
 
 def test_off_road_distance_is_that_of_the_farthest_corner():

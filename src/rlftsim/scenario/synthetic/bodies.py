@@ -5,6 +5,7 @@ Arrays run over the steps (0.1 s) during which a road user exists; positions in 
 
 import math
 import re
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -278,27 +279,38 @@ Lanes that follow one another may not quite meet: bicycles keep right in a car's
 LONGEST_EVALUATED_M = 7.0
 
 
-def _read_table(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray] | None:
-    """Columns of a trajectory file; None where SUMO has written no file or no rows."""
+def _read_users(
+    path: Path, user: str, names: tuple[str, ...], lanes: Collection[str] = ()
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """First step and rows of every road user in time order; a user with a gap in time counts as two.
+
+    Args:
+        path: Trajectory file; there are no users where SUMO has written no file or no rows.
+        user: SUMO's word for the users, "vehicle" or "person".
+        names: Columns that are read besides id and pose.
+        lanes: Ids of the lanes whose rows count; empty = all rows do.
+    """
+    columns = {"time": "timestep_time"} | {name: f"{user}_{name}" for name in ("id", "x", "y", "angle", *names)}
     if not path.exists():
-        return None
-    table = pyarrow.csv.read_csv(path, parse_options=pyarrow.csv.ParseOptions(delimiter=";"))
-    if not set(names) <= set(table.column_names) or table.num_rows == 0:
-        return None
-    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in names}
-
-
-def _runs_by_id(ids: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
-    """Row indices of every road user in time order; a user with a gap in time counts as two."""
-    # by road user, then by time
+        return
+    file = pyarrow.csv.read_csv(path, parse_options=pyarrow.csv.ParseOptions(delimiter=";"))
+    if not set(columns.values()) <= set(file.column_names) or file.num_rows == 0:
+        return
+    table = {name: file.column(column).to_numpy(zero_copy_only=False) for name, column in columns.items()}
+    if lanes:
+        is_on_lane = np.array([lane in lanes for lane in table["lane"]])
+        table = {name: column[is_on_lane] for name, column in table.items()}
+    step, ids = np.rint((table["time"] - DISCARDED_S) / STEP_S).astype(int), table["id"]
     order = np.lexsort((step, ids.astype(str)))
     new = (ids[order][1:] != ids[order][:-1]) | (np.diff(step[order]) != 1)
-    return [run for run in np.split(order, np.flatnonzero(new) + 1) if len(run) >= MIN_STEPS]
+    for run in np.split(order, np.flatnonzero(new) + 1):
+        if len(run) >= MIN_STEPS:
+            yield int(step[run[0]]), {name: column[run] for name, column in table.items()}
 
 
 def _lane_path(lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> BumperPath:
     """Bumper of a vehicle along lane centers, with the jumps between neighboring lanes listed as lane changes."""
-    lane_ids, positions = rows["vehicle_lane"], rows["vehicle_pos"]
+    lane_ids, positions = rows["lane"], rows["pos"]
     center = np.empty((len(lane_ids), 2))
     direction = np.empty_like(center)
     starts = np.append(0, np.flatnonzero(lane_ids[1:] != lane_ids[:-1]) + 1)
@@ -319,15 +331,11 @@ def _lane_path(lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: 
         if abs(left_m) > SMALLEST_JUMP_M:
             changes.append(int(start))
             distances.append(left_m)
-    return BumperPath(first_step, center, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
+    return BumperPath(first_step, center, direction, rows["speed"], tuple(changes), tuple(distances))
 
 
-def _read_poses(
-    table: dict[str, np.ndarray], user: str, run: np.ndarray, step: np.ndarray
-) -> tuple[str, int, list[SumoPose]]:
-    """SUMO's id, first step and poses of a "vehicle" or "person" whose rows are `run`."""
-    columns = (table[f"{user}_{name}"][run].astype(float).tolist() for name in ("x", "y", "angle"))
-    return str(table[f"{user}_id"][run[0]]), int(step[run[0]]), list(zip(*columns))
+def _list_poses(rows: dict[str, np.ndarray]) -> list[SumoPose]:
+    return list(zip(*(rows[name].astype(float).tolist() for name in ("x", "y", "angle"))))
 
 
 def read_vehicles(
@@ -342,27 +350,19 @@ def read_vehicles(
         rng: Generator of heights and of the drivers' habits.
         is_causal: True = boxes are made from the past alone, as worlds that run again need; False = smooth ones.
     """
-    names = ("timestep_time", "vehicle_id", "vehicle_type", "vehicle_speed", "vehicle_pos", "vehicle_lane")
-    names = (*names, "vehicle_x", "vehicle_y", "vehicle_angle")
-    table = _read_table(path, names)
-    if table is None:
-        return []
-    is_on_lane = np.array([lane in network.lanes for lane in table["vehicle_lane"]])
-    table = {name: column[is_on_lane] for name, column in table.items()}
-    step = np.rint((table["timestep_time"] - DISCARDED_S) / STEP_S).astype(int)
     bodies = []
-    for run in _runs_by_id(table["vehicle_id"], step):
-        user_type = types[str(table["vehicle_type"][run[0]])]
+    for first_step, rows in _read_users(path, "vehicle", ("type", "speed", "pos", "lane"), network.lanes):
+        user_type = types[str(rows["type"][0])]
         # a type has one size for SUMO; heights may differ, because SUMO does not know them
         height = user_type.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
         habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))
         size = (user_type.length_m, user_type.width_m, height)
         is_evaluable = user_type.length_m <= LONGEST_EVALUATED_M
         if is_causal:
-            dragged = _read_poses(table, "vehicle", run, step)
+            dragged = str(rows["id"][0]), first_step, _list_poses(rows)
             bodies.append(build_causal_body(*dragged, user_type.object_type, size, habit[0], is_evaluable))
             continue
-        lane_path = _lane_path(network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
+        lane_path = _lane_path(network.lanes, rows, first_step)
         bodies.append(build_vehicle(lane_path, user_type.object_type, size, habit, is_evaluable))
     return bodies
 
@@ -375,24 +375,20 @@ def read_pedestrians(path: Path, rng: np.random.Generator, is_causal: bool = Fal
         rng: Generator of the pedestrians' sizes.
         is_causal: True = boxes are made from the past alone, as worlds that run again need; False = smooth ones.
     """
-    names = ("timestep_time", "person_id", "person_x", "person_y", "person_angle")
-    table = _read_table(path, names)
-    if table is None:
-        return []
-    step = np.rint((table["timestep_time"] - DISCARDED_S) / STEP_S).astype(int)
     bodies = []
-    for run in _runs_by_id(table["person_id"], step):
-        position = np.stack([table["person_x"][run], table["person_y"][run]], axis=1).astype(float)
+    for first_step, rows in _read_users(path, "person", ()):
+        position = np.stack([rows["x"], rows["y"]], axis=1).astype(float)
         if np.linalg.norm(np.diff(position, axis=0), axis=1).max() > LONGEST_STRIDE_M:
             # SUMO moves a few of them at once to the other side of a junction; smoothing hides jumps of a meter only
             continue
         # SUMO's angles are clockwise from north
         size = draw_size(rng, "pedestrian")
         if is_causal:
-            bodies.append(build_causal_body(*_read_poses(table, "person", run, step), ObjectType.PEDESTRIAN, size))
+            dragged = str(rows["id"][0]), first_step, _list_poses(rows)
+            bodies.append(build_causal_body(*dragged, ObjectType.PEDESTRIAN, size))
             continue
-        heading = np.pi / 2 - np.radians(float(table["person_angle"][run[0]]))
-        bodies.append(build_pedestrian(int(step[run[0]]), position, heading, size))
+        heading = np.pi / 2 - np.radians(float(rows["angle"][0]))
+        bodies.append(build_pedestrian(first_step, position, heading, size))
     return bodies
 
 

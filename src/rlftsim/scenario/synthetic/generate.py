@@ -1,6 +1,5 @@
 """Make a data set of synthetic scenarios: a shard for each street network, several networks at a time."""
 
-import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -12,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
-from rlftsim.jobs.files import remove_temporaries, write_text
-from rlftsim.jobs.folder import Lease, check_folder, find_differences
+from rlftsim.jobs.files import remove_temporaries
+from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner, check_begun, choose_runner
@@ -213,7 +212,7 @@ def generate(
         # not what other shares of the same run make in this moment
         if folder.exists() and any(p.name != INCOMPLETE and p.suffix != ".tmp" for p in folder.iterdir()):
             raise DataError(f"{folder} is not empty: choose another folder or delete it")
-        write_text(marker, json.dumps(provenance, indent=1))
+        write_identity(marker, provenance)
 
     # 2. Make the shards that are not there yet.
     shards = folder / SHARDS

@@ -5,8 +5,9 @@ line between the two directions). Lanes lie to the right of the border and are l
 counts.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -82,7 +83,7 @@ class StreetPlan:
     nodes: tuple[Node, ...]
     streets: tuple[Street, ...]
     connections: tuple[Connection, ...] = ()
-    tapers: tuple[Float[np.ndarray, "3 2"], ...] = field(default=())
+    tapers: tuple[Float[np.ndarray, "3 2"], ...] = ()
     """Paved triangles where a lane begins or ends beside a freeway."""
 
     @property
@@ -202,7 +203,7 @@ def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float
     return tuple(lanes)
 
 
-def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node) -> tuple[Street, Street]:
+def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node) -> Iterator[Street]:
     """Both directions of a street, each with a separate strip of parking."""
     # The line between the directions is straight or bulges. The squared sine keeps both ends straight, where junctions
     # are cut out.
@@ -214,28 +215,18 @@ def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Nod
         bulge = np.clip(rng.normal(0, 0.035 * length), -0.08 * length, 0.08 * length) * np.sin(np.pi * s) ** 2
         middle = middle + bulge[:, None] * (np.array([-direction[1], direction[0]]) / length)
     gutter = float(rng.uniform(0.3, 2.0))
-    ids = (f"{start.node_id}to{end.node_id}", f"{end.node_id}to{start.node_id}")
-    forward = Street(
-        street_id=ids[0],
-        from_node=start.node_id,
-        to_node=end.node_id,
-        points=offset_polyline(middle, -profile.median_m / 2),
-        street_class=profile.street_class,
-        lanes=_draw_lanes(rng, profile, gutter),
-        speed_mps=profile.speed_mps,
-        priority=profile.priority,
-        reverse_id=None if profile.median_m else ids[1],
-    )
-    backward = replace(
-        forward,
-        street_id=ids[1],
-        from_node=end.node_id,
-        to_node=start.node_id,
-        points=offset_polyline(middle[::-1], -profile.median_m / 2),
-        lanes=_draw_lanes(rng, profile, gutter),
-        reverse_id=None if profile.median_m else ids[0],
-    )
-    return forward, backward
+    for tail, head, line in ((start, end, middle), (end, start, middle[::-1])):
+        yield Street(
+            street_id=f"{tail.node_id}to{head.node_id}",
+            from_node=tail.node_id,
+            to_node=head.node_id,
+            points=offset_polyline(line, -profile.median_m / 2),
+            street_class=profile.street_class,
+            lanes=_draw_lanes(rng, profile, gutter),
+            speed_mps=profile.speed_mps,
+            priority=profile.priority,
+            reverse_id=None if profile.median_m else f"{head.node_id}to{tail.node_id}",
+        )
 
 
 def _draw_links(
@@ -323,16 +314,11 @@ def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
     reach = max(float(np.linalg.norm(end)) for _, end, _ in stubs)
     shrink = min(1.0, MAX_RADIUS_M / reach)
     # 2. Nodes, whose control depends on the number of streets that meet there.
-    degree = np.zeros((columns, rows), int)
-    for a, b, _ in links:
-        degree[a] += 1
-        degree[b] += 1
-    for a, _, _ in stubs:
-        degree[a] += 1
+    degree = Counter([node for *pair, _ in links for node in pair] + [node for node, *_ in stubs])
     inner = {}
     for i, j in np.ndindex(columns, rows):
         crossing = (classes[i], classes[columns + j])
-        control = _draw_control(rng, crossing, int(degree[i, j]), 0.2 if quiet else 1.0)
+        control = _draw_control(rng, crossing, degree[i, j], 0.2 if quiet else 1.0)
         inner[i, j] = Node(f"n{i}{j}", grid[i, j] * shrink, control)
     fringe = [Node(f"f{k}", end * shrink, "dead_end", is_fringe=True) for k, (_, end, _) in enumerate(stubs)]
     # 3. Both directions of every street.

@@ -37,9 +37,7 @@ Size = tuple[float, float, float]
 """Length, width and height in meters."""
 
 
-def moves_plausibly(
-    position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], is_vehicle: bool = True
-) -> bool:
+def moves_plausibly(position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], is_vehicle: bool) -> bool:
     """True for a path within the limits of acceleration, for vehicles also within those of slip and turning per step.
 
     Args:
@@ -127,8 +125,7 @@ _STOP = (LightState.STOP, LightState.ARROW_STOP)
 _LIGHT_STATES = {
     "G": (LightState.GO, LightState.ARROW_GO),
     "g": (LightState.GO, LightState.GO),
-    "y": (LightState.CAUTION, LightState.ARROW_CAUTION),
-    "Y": (LightState.CAUTION, LightState.ARROW_CAUTION),
+    **dict.fromkeys("yY", (LightState.CAUTION, LightState.ARROW_CAUTION)),
 }
 """WOMD's states, without and with an arrow, for the letters of SUMO; all others mean stop."""
 
