@@ -22,7 +22,7 @@ from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import Past, Scene, View
 from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere
-from rlftsim.rollout.policy import DecisionDistribution
+from rlftsim.rollout.policy import DecisionDistribution, Prediction
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -89,19 +89,6 @@ class State:
     num_decisions: int = 0
     """Decisions taken so far."""
     cache: DecoderCache = field(default_factory=DecoderCache)
-
-
-@dataclass(frozen=True, eq=False)
-class TeacherForced:
-    """Predictions along logged tracks, and the tokens of the log."""
-
-    logits: Float[Tensor, "R V"]
-    target: Int64[Tensor, "R"]
-    """Token that came next."""
-    target_mask: Bool[Tensor, "R"]
-    """True = the next state was logged and the agent is trained on."""
-    class_id: Int64[Tensor, "R"]
-    """Agent class that each row's token ids refer to."""
 
 
 class SmartPolicy(SmartModel):
@@ -307,7 +294,7 @@ class SmartPolicy(SmartModel):
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
-    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> TeacherForced:
+    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
         """Predict every next token along the logged tracks.
 
         Args:
@@ -329,7 +316,7 @@ class SmartPolicy(SmartModel):
         class_id = class_of_type(scenarios.object_type)
         logits = self._predict(scene, rows[decides[steps.valid]], class_id, decides).logits
         class_id = class_id[:, None, :, None].expand(decides.shape)[decides]
-        return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
+        return Prediction(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
     # ---- passes of the decoder and the head -----------------------------------------------------------------------
 
