@@ -53,6 +53,28 @@ def read_tensors(
         raise error(f"{path}: damaged safetensors file ({first_line(problem)}): {remedy}.") from None
 
 
+def find_misfits(
+    tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, may_convert: bool = False
+) -> list[str]:
+    """Names, shapes and number types by which tensors are not those of a module, a text for each.
+
+    Args:
+        tensors: Tensors by name, as in a file.
+        expected: State dict of the module, maybe on no device; only names, shapes and types are read.
+        may_convert: True = floats may have another precision.
+    """
+    problems = [f"missing {name}" for name in sorted(expected.keys() - tensors.keys())]
+    problems += [f"unknown {name[:100]}" for name in sorted(tensors.keys() - expected.keys())]
+    for name in sorted(expected.keys() & tensors.keys()):
+        tensor, counterpart = tensors[name], expected[name]
+        are_floats = tensor.is_floating_point() and counterpart.is_floating_point()
+        if tensor.shape != counterpart.shape:
+            problems.append(f"{name} has shape {tuple(tensor.shape)} instead of {tuple(counterpart.shape)}")
+        elif tensor.dtype != counterpart.dtype and not (may_convert and are_floats):
+            problems.append(f"{name} is {tensor.dtype} instead of {counterpart.dtype}")
+    return problems
+
+
 def read_npz(
     path: str | PathLike[str], names: Sequence[str], remedy: str, *, error: type[RlftsimError] = DataError
 ) -> dict[str, np.ndarray]:

@@ -1,7 +1,7 @@
 """TrafficBots models, each with the numbers of the training."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 
@@ -19,7 +19,7 @@ from rlftsim.training.config import CatkConfig, FinetuneConfig, GcslConfig, KlCo
 class TrafficBotsRecipe(Recipe):
     """All settings from fresh weights to the fine-tuned TrafficBots policy, which has neither tokens nor goals."""
 
-    model_name = "TrafficBots V1.5"
+    model_name, policy_type = "TrafficBots V1.5", TrafficBotsPolicy
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
     gcsl: GcslConfig | None = None
@@ -39,19 +39,6 @@ class TrafficBotsRecipe(Recipe):
             raise ConfigError("a TrafficBots model has no vocabulary: leave --vocabulary out.")
         torch.manual_seed(self.pretrain.seed)
         return TrafficBotsPolicy(self.model)
-
-    def like(self, policy: Policy) -> "TrafficBotsRecipe":
-        """The same recipe for TrafficBots policies of the sizes of an existing policy.
-
-        Raises:
-            ConfigError: the policy is no TrafficBots policy.
-        """
-        if not isinstance(policy, TrafficBotsPolicy):
-            raise ConfigError(
-                f"this recipe makes TrafficBots policies, none like a {type(policy).__name__}: name a recipe that "
-                "does, `rlftsim recipe` lists them."
-            )
-        return replace(self, model=policy.config)
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()

@@ -234,9 +234,8 @@ class Validator:
         scores = torch.zeros(len(self._choice), len(WATCHED), dtype=torch.float64, device=fabric.device)
         measures_map = config.map_use and predicts_tokens(frozen)
         map_use = torch.zeros(2, 3, dtype=torch.float64, device=fabric.device)
-        for selected in (
-            rows[k : k + config.scenarios_per_pass] for k in range(0, len(rows), config.scenarios_per_pass)
-        ):
+        for first in range(0, len(rows), config.scenarios_per_pass):
+            selected = rows[first : first + config.scenarios_per_pass]
             batch = batch_with_futures(self._scenarios, [self._choice[row] for row in selected]).to(fabric.device)
             with fabric.autocast():
                 rollouts = simulate(
