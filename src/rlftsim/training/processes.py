@@ -103,12 +103,6 @@ def _help(work: Callable[[Fabric], object], process: "LinkedProcess", inherited:
 class LostProcessError(DataError):
     """A process of the run died."""
 
-    def __init__(self) -> None:
-        super().__init__(
-            "a training process died (out of memory?): run the same command again, it resumes. If that happens again, "
-            "lower micro_batch_size or device.processes."
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class LinkedProcess:
@@ -163,7 +157,10 @@ def _receive(link: Connection) -> Tensor:
     try:
         message = link.recv()
     except (EOFError, ConnectionError):
-        raise LostProcessError from None
+        raise LostProcessError(
+            "a training process died (out of memory?): run the same command again, it resumes. If that happens again, "
+            "lower micro_batch_size or device.processes."
+        ) from None
     if isinstance(message, Exception):
         raise message
     return torch.from_numpy(message)

@@ -144,11 +144,8 @@ def build_catk_vocabulary(tables: dict[str, np.ndarray], source: str, *, num_map
 
 def has_published_tokens(vocabulary: Vocabulary) -> bool:
     """True if the motion tokens are those that CAT-K published, by sha256."""
-    tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
-    return all(
-        hashlib.sha256(np.ascontiguousarray(t, np.float32).tobytes()).hexdigest() == _PUBLISHED[name]
-        for name, t in tables.items()
-    )
+    tables = (np.ascontiguousarray(table, np.float32).tobytes() for table in vocabulary.corners.cpu().numpy())
+    return [hashlib.sha256(table).hexdigest() for table in tables] == [_PUBLISHED[name] for name in MOTION_TABLES]
 
 
 def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:

@@ -153,13 +153,8 @@ class SmartPolicy(SmartModel):
         if goals is None or not self.is_goal_conditioned or not goals.any:
             return State(position, heading, context.past.repeat(num_rollouts), pending=None)
         # the context is goal-free: the current step goes through the decoder again, with goals; earlier steps do not
-        return State(
-            position,
-            heading,
-            context.past.without_last_step().repeat(num_rollouts),
-            pending=current,
-            goals=encode_goals(goals, context.scene.map_positions),
-        )
+        past = context.past.without_last_step().repeat(num_rollouts)
+        return State(position, heading, past, current, goals=encode_goals(goals, context.scene.map_positions))
 
     def decide(self, context: Context, state: State) -> TokenDistribution:
         """Distributions [B, N, A] of the next token of every agent.
