@@ -197,7 +197,7 @@ class Validator:
         self._choice = config.choose(len(scenarios))
         clusters = getattr(scenarios, "clusters", np.arange(len(scenarios)))  # lists of scenarios name none
         self._clusters = np.array(clusters)[self._choice]
-        if start is not None and len(set(self._clusters)) == 1 and fabric.is_global_zero:
+        if start is not None and len(set(self._clusters)) == 1 and fabric.global_rank == 0:
             log.warning("all scenarios of the validation are of one street network: gains hold for it alone.")
         self._start = None if start is None else self._measure(start)[1]
 

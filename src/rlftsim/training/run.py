@@ -140,7 +140,7 @@ def _hold_folder(out: Path, fabric: Fabric) -> Iterator[None]:
     """
     refusal = None
     with ExitStack() as stack:
-        if fabric.is_global_zero:
+        if fabric.global_rank == 0:
             try:
                 lease = stack.enter_context(Lease(out / ".lock", Inline(), "works in"))
                 stack.callback(lease.remove)
@@ -185,7 +185,8 @@ class TrainingRun:
         Raises:
             CheckpointError: The folder belongs to a run with other settings or inputs.
         """
-        self.fabric, self.scenarios = fabric, share_cache(self.scenarios, num_sharing_memory(fabric))
+        self.fabric, self.is_first = fabric, fabric.global_rank == 0
+        self.scenarios = share_cache(self.scenarios, num_sharing_memory(fabric))
         if self.held_out is not None and self.settings.validation.every:
             check_validation(self.policy, self.held_out, self.settings.validation)
         else:
@@ -213,7 +214,7 @@ class TrainingRun:
                         self.keep_best(report.values)
                     is_last = ends or is_stopped()
                     self.finish_update(replace(report, note=report.note + note), is_last=is_last)
-                    if self.on_update is not None and fabric.is_global_zero:
+                    if self.on_update is not None and self.is_first:
                         self.on_update(learner.update, dict(report.values))
                     if is_last:
                         break
@@ -221,16 +222,15 @@ class TrainingRun:
 
     def _open(self) -> None:
         """Open the folder, and warn of a run that ends in the warm-up."""
-        learner, is_first = self.learner, self.fabric.is_global_zero
-        total = self.settings.num_updates(len(self.scenarios))
+        learner, total = self.learner, self.settings.num_updates(len(self.scenarios))
         self.num_updates = min(total, self.max_updates or total)
         inputs = {**describe_inputs(learner.policy, self.scenarios, self.held_out), **learner.inputs}
-        self.folder = RunFolder(self.out, self.settings, inputs, writes=is_first, may_grow=learner.may_grow)
+        self.folder = RunFolder(self.out, self.settings, inputs, writes=self.is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
         self._best: tuple[float, int] | None = None
         """Lower bound of the gain in the best validation so far, and its update."""
         # Such a run ends with nearly its initial weights, which looks like a method that does not work.
-        if self.num_updates < self.settings.warmup_updates and is_first:
+        if self.num_updates < self.settings.warmup_updates and self.is_first:
             log.warning(
                 f"the run ends after {self.num_updates} of {self.settings.warmup_updates} warm-up updates, so its "
                 "weights hardly move: raise epochs or max_updates, or lower warmup_updates."
@@ -260,7 +260,7 @@ class TrainingRun:
         for values in read_metrics(self.folder.path):
             if values["update"] <= learner.update:  # the process of rank 0 may not have dropped the others yet
                 self._choose_best(values)
-        if self.fabric.is_global_zero and learner.update < self.num_updates:
+        if self.is_first and learner.update < self.num_updates:
             if self.folder.has_model:
                 log.info(f"{self.folder.model} stays the model of the shorter run until this one ends.")
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
@@ -276,11 +276,10 @@ class TrainingRun:
         Raises:
             KeyboardInterrupt: Ctrl-C or a similar signal, when the update is done.
         """
-        waits = self.fabric.world_size == 1 or forks_processes(self.settings.device)
-        is_shown = self.fabric.is_global_zero
+        title, waits = self.method.title, self.fabric.world_size == 1 or forks_processes(self.settings.device)
         try:
             with (
-                progress_bar(self.method.title, self.num_updates, self.learner.update, show=is_shown) as self._advance,
+                progress_bar(title, self.num_updates, self.learner.update, show=self.is_first) as self._advance,
                 ctrl_c_waits(enabled=waits) as is_stopped,
             ):
                 yield is_stopped
@@ -300,7 +299,7 @@ class TrainingRun:
         Args:
             values: Metrics of the update, those of its validation included.
         """
-        if self._choose_best({**values, "update": self.learner.update}) and self.fabric.is_global_zero:
+        if self._choose_best({**values, "update": self.learner.update}) and self.is_first:
             self.folder.write_best(self.learner.update, self.learner.result)
 
     def _choose_best(self, values: Mapping[str, Any]) -> bool:
@@ -326,7 +325,7 @@ class TrainingRun:
         learner = self.learner
         # The line is written first, so that a run that ends here shows why.
         self.folder.log(learner.update, report.values)
-        if self.fabric.is_global_zero:
+        if self.is_first:
             if learner.skipped_in_a_row:
                 limit = f"{learner.skipped_in_a_row} in a row, the run stops at {self.settings.max_skipped_in_a_row}"
                 log.warning(f"update {learner.update} skipped: {report.skipped_because} ({limit})")
@@ -337,7 +336,7 @@ class TrainingRun:
         # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
         is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
         self._check_divergence(report, has_checked_weights=is_due)
-        if is_due and self.fabric.is_global_zero:
+        if is_due and self.is_first:
             numbers = learner.to_numbers() | ({STOPPED: 1.0} if report.stop_because else {})
             progress = Progress(learner.update, numbers)
             write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
@@ -364,7 +363,7 @@ class TrainingRun:
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds
             learner.policy.load_state_dict(learner.result.state_dict())
-        if self.fabric.is_global_zero:
+        if self.is_first:
             learner.policy.eval().save_pretrained(self.folder.model, card=self.card)
         self.folder.finish_trackers("finished")
         return self.folder.model
@@ -376,7 +375,7 @@ class TrainingRun:
         bound, update = self._best
         if update != self.learner.update:
             self.folder.load_best(update, self.learner.result)
-        if not self.fabric.is_global_zero:
+        if not self.is_first:
             return
         log.info(
             f"{self.folder.model} is the model of update {update}: the lower bound of its gain in RMM over the start, "
