@@ -244,10 +244,8 @@ class SmartPolicy(SmartModel):
         # 2. distributions of the agents; padding is left out
         mask = context.agent_mask[:, None, :, None].expand(features.shape[:4])
         num_left = (NUM_DECISIONS - torch.arange(mask.shape[3], device=mask.device)).expand(mask.shape)
-        poses = None
-        if state.goals is not None:
-            assert state.pending is not None  # with goals even the current step was pending
-            poses = Poses(state.pending.position, state.pending.heading)
+        # with goals even the current step was pending
+        poses = None if state.pending is None else Poses(state.pending.position, state.pending.heading)
         return self._build_distribution(context, state, features[mask], mask, poses, num_left)
 
     # ---- passes that share scenes and views -------------------------------------------------------------------------
