@@ -58,10 +58,8 @@ class StoredModel:
         Raises:
             CheckpointError: The file is missing or damaged.
         """
-        try:
-            return read_tensors(self.folder / WEIGHTS, _REPAIR, error=CheckpointError)[0]
-        except FileNotFoundError:
-            raise CheckpointError(f"{self.folder}: not a model folder, {WEIGHTS} is missing.") from None
+        missing = f"{self.folder}: not a model folder, {WEIGHTS} is missing."
+        return read_tensors(self.folder / WEIGHTS, _REPAIR, error=CheckpointError, missing=missing)[0]
 
     def build(self, make: Callable[..., Loaded]) -> Loaded:
         """Result of a call with the stored settings as keyword arguments.

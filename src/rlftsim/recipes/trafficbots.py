@@ -7,7 +7,7 @@ import torch
 
 from rlftsim.errors import ConfigError
 from rlftsim.policies.checkpoint import load_strictly
-from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo, trafficbots_v15
+from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
@@ -63,7 +63,6 @@ class TrafficBotsRecipe(Recipe):
 def trafficbots_v15_rlftsim() -> TrafficBotsRecipe:
     """The paper: TrafficBots V1.5 (7.9 M), pre-trained on WOMD for 1 epoch, fine-tuned for 12 000 updates."""
     return TrafficBotsRecipe(
-        model=trafficbots_v15(),
         pretrain=PretrainConfig(
             epochs=1.0, batch_size=8, micro_batch_size=2, learning_rate=2e-4, final_lr_ratio=1.0, betas=(0.9, 0.95),
             weight_decay=0.1, gradient_clip=5.0, label_smoothing=0.0, context_radius_m=None,

@@ -418,10 +418,8 @@ def write_catk(policy: SmartPolicy, path: Path) -> None:
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by the public code's names, and the file's settings of the decoder and the tokens, empty without any."""
     if path.suffix == ".safetensors":
-        try:
-            weights, settings = read_tensors(path, "get the file again", error=CheckpointError)[0], {}
-        except FileNotFoundError:
-            raise CheckpointError(f"{path}: no such file.") from None
+        missing, settings = f"{path}: no such file.", {}
+        weights, _ = read_tensors(path, "get the file again", error=CheckpointError, missing=missing)
     else:
         weights, settings = read_lightning(path)
     weights = dict(strip_wrappers(weights, ()))
