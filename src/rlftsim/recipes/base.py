@@ -86,7 +86,7 @@ class Recipe:
             vocabulary = build_vocabulary(training, self.tokens)[0]
         return self.new_policy(vocabulary)
 
-    def like(self, policy: Policy) -> "Recipe":
+    def like(self, policy: Any) -> "Recipe":
         """The same recipe for policies of the architecture and sizes of an existing policy.
 
         Raises:
@@ -100,7 +100,7 @@ class Recipe:
                 f"this recipe makes {self.model_name} policies, none like a {name}: name a recipe that does, `rlftsim "
                 "recipe` lists them."
             )
-        return replace(self, **{"model": getattr(policy, "config")})  # noqa: B009
+        return replace(self, model=policy.config)
 
     @property
     def free_fields(self) -> tuple[str, ...]:
