@@ -6,7 +6,7 @@ A settings class is a frozen dataclass: a run stores it, a recipe has one for ea
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -570,10 +570,6 @@ class CalibrateConfig:
     seed: int = 0
     """Seed of everything that is random in the run."""
     device: DeviceConfig = field(default_factory=DeviceConfig)
-    warmup_updates: ClassVar[int] = 0
-    """There is no learning rate."""
-    max_skipped_in_a_row: ClassVar[int] = 1
-    """No batch is skipped."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -591,6 +587,16 @@ class CalibrateConfig:
                 raise ConfigError(f"no constraint {name!r}: there are {', '.join(CONSTRAINED_MEANS)}.")
         check_metric(self.metric)
         object.__setattr__(self, "reward", complete_reward(self.reward)[0])
+
+    @property
+    def warmup_updates(self) -> int:
+        """0: there is no learning rate."""
+        return 0
+
+    @property
+    def max_skipped_in_a_row(self) -> int:
+        """1: no batch is skipped."""
+        return 1
 
     def split_sizes(self, num_scenarios: int) -> tuple[int, int]:
         """Number of scenarios for the direction, and of scenarios held back for the length.

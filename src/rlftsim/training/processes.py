@@ -110,7 +110,7 @@ class LinkedProcess:
 
     device: torch.device
     autocast: Callable[[], AbstractContextManager[Any]]
-    backward: Callable[[Tensor], None]
+    backward: Callable[..., None]
     """These three are those of a process alone."""
     global_rank: int
     world_size: int
