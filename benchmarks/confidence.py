@@ -20,7 +20,7 @@ from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import STILL_TOKEN
 from rlftsim.training.data import batch_with_futures, trained_agents
-from rlftsim.training.monitoring import MapUse, measure_map_use
+from rlftsim.training.monitoring import measure_map_use
 
 FAST_MPS, STEP_S, TOKEN_S = 10.0, 0.1, 0.5
 VEHICLE_CLASS, VEHICLE_TYPE = 0, 1
@@ -54,7 +54,7 @@ def main() -> None:
             real, expected, stands = group[:, 4:].mean(0).tolist()
             print(f"  | {low:g} to {high:g} m | {len(group)} | {real:.2f} | {expected:.2f} | {stands:.1%} |")
         batches = (collate([scenarios[i]]) for i in range(len(scenarios)))
-        _, turning = sum((measure_map_use(policy, one) for one in batches), start=MapUse.zero()).sums
+        _, turning = torch.stack([measure_map_use(policy, one) for one in batches]).sum(0)
         number, with_map, without = turning.tolist()
         print(f"  turning tokens: loss {with_map / number:.2f}, map use {(without - with_map) / number:.2f} nats")
         first, then, last, at_last = speeds.nanmean(0).tolist()

@@ -53,5 +53,5 @@ def test_a_prefix_that_is_a_part_of_the_names_stays():
 
 
 def test_whole_numbers_are_no_weights():
-    with pytest.raises(CheckpointError, match=r"weight holds torch\.int64 instead of torch\.float32"):
+    with pytest.raises(CheckpointError, match=r"weight is torch\.int64 instead of torch\.float32"):
         load_strictly(nn.Linear(1, 1, bias=False), {"weight": torch.ones(1, 1, dtype=torch.int64)}, source="x")

@@ -18,7 +18,7 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.training.config import AlarmConfig, FinetuneConfig, ValidationConfig
-from rlftsim.training.monitoring import measure_map_use
+from rlftsim.training.monitoring import describe_map_use, measure_map_use
 from rlftsim.training.run import TrainingRun
 from rlftsim.training.run_folder import read_metrics
 
@@ -217,7 +217,7 @@ def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary
     leaves = np.nanmean(np.array(found.values("unlogged_offroad_rate"))[rows])
     assert line["validation_unlogged_offroad_rate"] == pytest.approx(leaves, abs=1e-6)
     batch = collate([held_out[i] for i in everything.choose(len(held_out))])
-    map_use = measure_map_use(model.eval(), batch).to_metrics("validation_")
+    map_use = describe_map_use(measure_map_use(model.eval(), batch), "validation_")
     assert {name: line[name] for name in map_use} == pytest.approx(map_use, abs=1e-4, nan_ok=True)
 
 

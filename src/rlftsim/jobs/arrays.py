@@ -30,7 +30,7 @@ _ARRAY_DAMAGE = (
 
 
 def read_tensors(
-    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError
+    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
 ) -> tuple[dict[str, Tensor], Mapping[str, str]]:
     """Tensors of a safetensors file by name, on the CPU, and the texts in the header.
 
@@ -38,19 +38,44 @@ def read_tensors(
         path: Safetensors file; the header is checked against the size of the file before any tensor is made.
         remedy: Way out at the end of every message, such as "write it again".
         error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
-        FileNotFoundError: No such file; the caller names the file in the message.
-        RlftsimError: Damaged file.
+        FileNotFoundError: No such file, without `missing`; the caller names the file in the message.
+        RlftsimError: Damaged file, or no such file.
     """
     try:
         check_has_end(path)
         with safe_open(path, framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
+        if missing:
+            raise error(missing) from None
         raise
     except _TENSOR_DAMAGE as problem:
         raise error(f"{path}: damaged safetensors file ({first_line(problem)}): {remedy}.") from None
+
+
+def find_misfits(
+    tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, may_convert: bool = False
+) -> list[str]:
+    """Names, shapes and number types by which tensors are not those of a module, a text for each.
+
+    Args:
+        tensors: Tensors by name, as in a file.
+        expected: State dict of the module, maybe on no device; only names, shapes and types are read.
+        may_convert: True = floats may have another precision.
+    """
+    problems = [f"missing {name}" for name in sorted(expected.keys() - tensors.keys())]
+    problems += [f"unknown {name[:100]}" for name in sorted(tensors.keys() - expected.keys())]
+    for name in sorted(expected.keys() & tensors.keys()):
+        tensor, counterpart = tensors[name], expected[name]
+        are_floats = tensor.is_floating_point() and counterpart.is_floating_point()
+        if tensor.shape != counterpart.shape:
+            problems.append(f"{name} has shape {tuple(tensor.shape)} instead of {tuple(counterpart.shape)}")
+        elif tensor.dtype != counterpart.dtype and not (may_convert and are_floats):
+            problems.append(f"{name} is {tensor.dtype} instead of {counterpart.dtype}")
+    return problems
 
 
 def read_npz(

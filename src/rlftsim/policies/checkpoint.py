@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from rlftsim.errors import CheckpointError, ConfigError, printable
-from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.arrays import find_misfits, read_tensors
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
@@ -36,7 +36,6 @@ SHIPPED_MODELS = Path(__file__).parent / "shipped"
 _REPAIR = "damaged model folder, write it again"
 _WRAPPERS = ("_orig_mod.", "module.")
 """Prefixes that torch.compile and distributed training put before the names of all weights."""
-_FLOATS = {torch.float16, torch.bfloat16, torch.float32, torch.float64}
 SHOWN_PROBLEMS = 6
 """Number of weights that a message names; in a model of other sizes a hundred do not fit."""
 
@@ -59,10 +58,8 @@ class StoredModel:
         Raises:
             CheckpointError: The file is missing or damaged.
         """
-        try:
-            return read_tensors(self.folder / WEIGHTS, _REPAIR, error=CheckpointError)[0]
-        except FileNotFoundError:
-            raise CheckpointError(f"{self.folder}: not a model folder, {WEIGHTS} is missing.") from None
+        missing = f"{self.folder}: not a model folder, {WEIGHTS} is missing."
+        return read_tensors(self.folder / WEIGHTS, _REPAIR, error=CheckpointError, missing=missing)[0]
 
     def build(self, make: Callable[..., Loaded]) -> Loaded:
         """Result of a call with the stored settings as keyword arguments.
@@ -310,15 +307,7 @@ def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], 
     Raises:
         CheckpointError: A name, shape or type differs; the message names the first few.
     """
-    problems = [f"missing {k}" for k in sorted(expected.keys() - weights.keys())]
-    problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - expected.keys())]
-    for k in sorted(expected.keys() & weights.keys()):
-        (shape, dtype), (model_shape, model_dtype) = ((w[k].shape, w[k].dtype) for w in (weights, expected))
-        if shape != model_shape:
-            problems.append(f"{k} has shape {tuple(shape)} instead of {tuple(model_shape)}")
-        if dtype != model_dtype and not {dtype, model_dtype} <= _FLOATS:
-            problems.append(f"{k} holds {dtype} instead of {model_dtype}")
-    if problems:
+    if problems := find_misfits(weights, expected, may_convert=True):
         text = printable(join_first(problems, "; "))
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {text}.")
 

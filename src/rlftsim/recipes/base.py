@@ -33,7 +33,7 @@ from rlftsim.training.config import (
 )
 
 SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl", "calibrate")
-"""Sections that the verbs of the command line know, in the order of their use; see `section_names`."""
+"""Sections that the verbs of the command line know, in the order of their use; see `list_sections`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +43,8 @@ class Recipe:
 
     model_name: ClassVar[str] = "model"
     """Name of the recipe's models in tables."""
+    policy_type: ClassVar[type | None] = None
+    """Class of the recipe's policies, whose `config` is a section `model`; None = the recipe makes none like others."""
     method: str = "rlft"
     """Method of fine-tuning where none is named."""
     tokens: TokensConfig | None = None
@@ -84,13 +86,21 @@ class Recipe:
             vocabulary = build_vocabulary(training, self.tokens)[0]
         return self.new_policy(vocabulary)
 
-    def like(self, policy: Policy) -> "Recipe":
+    def like(self, policy: Any) -> "Recipe":
         """The same recipe for policies of the architecture and sizes of an existing policy.
 
         Raises:
             ConfigError: A recipe that makes no such policies.
         """
-        raise ConfigError(f"{type(self).__name__} describes no policy like a {type(policy).__name__}.")
+        name = type(policy).__name__
+        if self.policy_type is None:
+            raise ConfigError(f"{type(self).__name__} describes no policy like a {name}.")
+        if not isinstance(policy, self.policy_type):
+            raise ConfigError(
+                f"this recipe makes {self.model_name} policies, none like a {name}: name a recipe that does, `rlftsim "
+                "recipe` lists them."
+            )
+        return replace(self, model=policy.config)
 
     @property
     def free_fields(self) -> tuple[str, ...]:
@@ -139,10 +149,9 @@ class Recipe:
 
     def with_processes(self, processes: int | Literal["auto"]) -> "Recipe":
         """The same recipe, trained by so many processes on this machine, see `DeviceConfig.processes`."""
-        sections = {name: getattr(self, name) for name in section_names(self)}
-        changed: dict[str, Any] = {
+        changed = {
             name: replace(section, device=replace(section.device, processes=processes))
-            for name, section in sections.items()
+            for name, section in list_sections(self).items()
             if isinstance(getattr(section, "device", None), DeviceConfig)
         }
         return replace(self, **changed)
@@ -153,12 +162,12 @@ class Recipe:
         Args:
             seed: Seed of all sections that have one, at least 0.
         """
-        sections = {name: getattr(self, name) for name in section_names(self)}
-        drawn = {name: section for name, section in sections.items() if hasattr(section, "seed")}
+        drawn = {name: section for name, section in list_sections(self).items() if hasattr(section, "seed")}
         return replace(self, **{name: replace(section, seed=seed) for name, section in drawn.items()})
 
 
-def section_names(recipe: Recipe) -> tuple[str, ...]:
-    """Names of the sections of a recipe: `SECTIONS` in the order of use, then the further sections."""
+def list_sections(recipe: Recipe) -> dict[str, Any]:
+    """Sections that a recipe has, by name: `SECTIONS` in the order of use, then the further sections."""
     present = [entry.name for entry in fields(recipe) if is_dataclass(getattr(recipe, entry.name))]
-    return tuple(sorted(present, key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)))
+    present.sort(key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS))
+    return {name: getattr(recipe, name) for name in present}

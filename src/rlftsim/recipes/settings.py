@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.documents import read_json
-from rlftsim.recipes.base import SECTIONS, Recipe, section_names
+from rlftsim.recipes.base import SECTIONS, Recipe, list_sections
 from rlftsim.recipes.docstrings import read_field_texts, summarize_docstring
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
@@ -29,11 +29,6 @@ def recipe_as_text(recipe: Recipe) -> str:
         for name, section in list_sections(recipe).items()
     ]
     return "\n\n".join([method, *sections])
-
-
-def list_sections(recipe: Recipe) -> dict[str, Any]:
-    """Sections that a recipe has, by name, in the order of use."""
-    return {name: getattr(recipe, name) for name in section_names(recipe)}
 
 
 def _write_lines(section: Any, indent: str) -> Iterator[str]:
@@ -65,7 +60,7 @@ def read_flags(path: Path, recipe: Recipe, sections: Sequence[str], run_section:
     # 1. sections by name
     values = read_settings(path)
     run_fields = [field.name for field in fields(getattr(recipe, run_section))]
-    is_run, is_recipe = set(values) & {*run_fields, *RUN_INPUTS}, set(values) & {*SECTIONS, *section_names(recipe)}
+    is_run, is_recipe = set(values) & {*run_fields, *RUN_INPUTS}, set(values) & {*SECTIONS, *list_sections(recipe)}
     # A run's config.json holds one section without its name; a printed recipe holds sections by name. A single
     # known name tells which it is, so that a mistyped one beside it is complained about in the right words.
     if is_run and not is_recipe:

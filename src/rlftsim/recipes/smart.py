@@ -30,7 +30,7 @@ from rlftsim.training.config import (
 class SmartRecipe(Recipe):
     """All settings from the vocabulary to the fine-tuned SMART policy."""
 
-    model_name = "SMART"
+    model_name, policy_type = "SMART", SmartPolicy
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
     road: RoadConfig | None = field(default_factory=RoadConfig)
@@ -54,19 +54,6 @@ class SmartRecipe(Recipe):
         # Directly before the weights are drawn: anything random in between would change every stored result.
         torch.manual_seed(self.pretrain.seed)
         return SmartPolicy(self.model, vocabulary)
-
-    def like(self, policy: Policy) -> "SmartRecipe":
-        """The same recipe for SMART policies of the sizes of an existing policy.
-
-        Raises:
-            ConfigError: the policy is no SMART policy.
-        """
-        if not isinstance(policy, SmartPolicy):
-            raise ConfigError(
-                f"this recipe makes SMART policies, none like a {type(policy).__name__}: name a recipe that does, "
-                "`rlftsim recipe` lists them."
-            )
-        return replace(self, model=policy.config)
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()

@@ -1,13 +1,13 @@
 """TrafficBots models, each with the numbers of the training."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 
 from rlftsim.errors import ConfigError
 from rlftsim.policies.checkpoint import load_strictly
-from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo, trafficbots_v15
+from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
@@ -19,7 +19,7 @@ from rlftsim.training.config import CatkConfig, FinetuneConfig, GcslConfig, KlCo
 class TrafficBotsRecipe(Recipe):
     """All settings from fresh weights to the fine-tuned TrafficBots policy, which has neither tokens nor goals."""
 
-    model_name = "TrafficBots V1.5"
+    model_name, policy_type = "TrafficBots V1.5", TrafficBotsPolicy
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
     gcsl: GcslConfig | None = None
@@ -39,19 +39,6 @@ class TrafficBotsRecipe(Recipe):
             raise ConfigError("a TrafficBots model has no vocabulary: leave --vocabulary out.")
         torch.manual_seed(self.pretrain.seed)
         return TrafficBotsPolicy(self.model)
-
-    def like(self, policy: Policy) -> "TrafficBotsRecipe":
-        """The same recipe for TrafficBots policies of the sizes of an existing policy.
-
-        Raises:
-            ConfigError: the policy is no TrafficBots policy.
-        """
-        if not isinstance(policy, TrafficBotsPolicy):
-            raise ConfigError(
-                f"this recipe makes TrafficBots policies, none like a {type(policy).__name__}: name a recipe that "
-                "does, `rlftsim recipe` lists them."
-            )
-        return replace(self, model=policy.config)
 
     def train_further(
         self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()
@@ -76,7 +63,6 @@ class TrafficBotsRecipe(Recipe):
 def trafficbots_v15_rlftsim() -> TrafficBotsRecipe:
     """The paper: TrafficBots V1.5 (7.9 M), pre-trained on WOMD for 1 epoch, fine-tuned for 12 000 updates."""
     return TrafficBotsRecipe(
-        model=trafficbots_v15(),
         pretrain=PretrainConfig(
             epochs=1.0, batch_size=8, micro_batch_size=2, learning_rate=2e-4, final_lr_ratio=1.0, betas=(0.9, 0.95),
             weight_decay=0.1, gradient_clip=5.0, label_smoothing=0.0, context_radius_m=None,

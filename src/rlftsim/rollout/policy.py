@@ -442,29 +442,18 @@ class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
         ...
 
 
-@runtime_checkable
-class Prediction(Protocol):
+@dataclass(frozen=True, eq=False)
+class Prediction:
     """Predicted next tokens of R elements and the tokens that should come next: input of a cross-entropy."""
 
-    @property
-    def logits(self) -> Float[Tensor, "R V"]:
-        """Logits over the vocabulary."""
-        ...
-
-    @property
-    def target(self) -> Int64[Tensor, "R"]:
-        """Token that should come next."""
-        ...
-
-    @property
-    def target_mask(self) -> Bool[Tensor, "R"]:
-        """True = the prediction counts."""
-        ...
-
-    @property
-    def class_id(self) -> Int64[Tensor, "R"]:
-        """Agent class that each row's token ids refer to."""
-        ...
+    logits: Float[Tensor, "R V"]
+    """Logits over the vocabulary."""
+    target: Int64[Tensor, "R"]
+    """Token that should come next."""
+    target_mask: Bool[Tensor, "R"]
+    """True = the prediction counts."""
+    class_id: Int64[Tensor, "R"]
+    """Agent class that each row's token ids refer to."""
 
 
 @runtime_checkable

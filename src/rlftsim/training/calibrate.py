@@ -111,11 +111,10 @@ class Statistics(nn.Module):
     def __init__(self, num_fitted: int, num_held_back: int, config: CalibrateConfig):
         super().__init__()
         width, num_credits = len(config.features), 1 + len(SUB_SCORES) + len(config.constraints)
-        self.register_buffer("gradients", torch.zeros(num_fitted, num_credits, width, dtype=torch.float64))
-        self.register_buffer("fisher", torch.zeros(width, width, dtype=torch.float64))
-        self.register_buffer("counts", torch.zeros(3, dtype=torch.float64))
-        shape = 1 + len(config.lengths), num_held_back, len({*MEASURED, *CONSTRAINTS}) + 2
-        self.register_buffer("scores", torch.zeros(shape, dtype=torch.float64))
+        num_scores = len({*MEASURED, *CONSTRAINTS}) + 2
+        shapes = {"gradients": (num_fitted, num_credits, width), "fisher": (width, width), "counts": (3,)}
+        for name, shape in (shapes | {"scores": (1 + len(config.lengths), num_held_back, num_scores)}).items():
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -199,15 +198,11 @@ class CalibrationLearner(Learner):
         step = length * self.direction
         eta = self.start.double().cpu().numpy() + step
         gradients = self.statistics.gradients.numpy()
-        table = []
-        for index, name in enumerate(self.config.features):
-            gains_by_score = {
-                score: float(step[index] * gradients[:, position, index].mean())
-                for position, score in enumerate(("rmm", *SUB_SCORES))
-            }
-            table.append(
-                {"feature": name, "eta": float(eta[index]), "t": t_value(gradients[:, 0, index]), **gains_by_score}
-            )
+        table = [
+            {"feature": name, "eta": float(eta[k]), "t": t_value(gradients[:, 0, k])}
+            | {score: float(step[k] * gradients[:, row, k].mean()) for row, score in enumerate(("rmm", *SUB_SCORES))}
+            for k, name in enumerate(self.config.features)
+        ]
         changes = []
         for row, (tried, kl) in enumerate(zip(self.config.lengths, kls[1:]), 1):
             changes.append({"length": tried, "kl": float(kl - kls[0])})

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Sampling, TokenPolicy
@@ -56,12 +55,7 @@ def roll_out_closest(
     Returns:
         The rollouts with targets, where the next logged state is valid and the present state is not too far off the
         log.
-
-    Raises:
-        ConfigError: no candidates.
     """
-    if num_candidates < 1:
-        raise ConfigError(f"num_candidates must be at least 1, got {num_candidates}.")
     # The log in steps of one token, 0.5 s: poses and validity, [B, A, tokens].
     tokens = tokenize_agents(batch, policy.vocabulary, catk_compat=catk_compat)
     decision_targets: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import CheckpointError
-from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.arrays import find_misfits, read_tensors
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import errors_name, remove_folder, save_tensors, write_text
 
@@ -103,8 +103,11 @@ def read_checkpoint(
     try:
         values = read_json(path / "progress.json", way_out, error=CheckpointError)
         # everything is checked before anything is loaded
-        weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
-        moments = _read(path / "optimizer.safetensors", way_out)
+        *files, moments = (
+            read_tensors(path / f"{name}.safetensors", way_out, error=CheckpointError)[0]
+            for name in (*modules, "optimizer")
+        )
+        weights = dict(zip(modules, files))
         _check_progress(values, parse_update(path), names)
         for name, module in modules.items():
             check_weights(name, weights[name], module)
@@ -118,13 +121,6 @@ def read_checkpoint(
     # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     return Progress(values["update"], values["numbers"])
-
-
-def _read(path: Path, way_out: str) -> dict[str, Tensor]:
-    try:
-        return read_tensors(path, way_out, error=CheckpointError)[0]
-    except FileNotFoundError:
-        raise CheckpointError(f"{path} is missing: {way_out}.") from None
 
 
 def _check_progress(values: Mapping[str, Any], update: int, names: Collection[str]) -> None:
@@ -149,12 +145,8 @@ def check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) -
         ValueError: A wrong name, shape or dtype, or a weight that is not finite.
     """
     state = module.state_dict()
-    if state.keys() != weights.keys():
-        raise ValueError(f"{name} lacks or adds {min(state.keys() ^ weights.keys())[:80]!r}")
-    for key, value in weights.items():
-        if (value.shape, value.dtype) != (state[key].shape, state[key].dtype):
-            expected = f"{state[key].dtype} {tuple(state[key].shape)}"
-            raise ValueError(f"{key} of {name} is {value.dtype} {tuple(value.shape)}, not {expected}")
+    if misfits := find_misfits(weights, state):
+        raise ValueError(f"{name}: {misfits[0]}")
     for key in state.keys() & dict(module.named_parameters()).keys():
         if not weights[key].isfinite().all():
             raise ValueError(f"{key} of {name} is not finite")

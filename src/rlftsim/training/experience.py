@@ -20,7 +20,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 from rlftsim.training.config import FinetuneConfig
-from rlftsim.training.goals import StoredGoals, choose_goals
+from rlftsim.training.goals import choose_goals
 from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
 
 
@@ -53,32 +53,24 @@ class Experience:
 
 
 def sample_rollouts(
-    policy: Any,
-    batch: ScenarioBatch,
-    config: FinetuneConfig,
-    augmented: StoredGoals | None,
-    rollout_ids: range,
-    update: int,
-    fabric: Fabric,
+    learner: Any, batch: ScenarioBatch, config: FinetuneConfig, rollout_ids: range, fabric: Fabric
 ) -> tuple[Any, Rollouts]:
     """Context and rollouts of an update, without gradient. All rollouts of a scenario have the same goals.
 
     Args:
-        policy: decides for all agents.
+        learner: Policy that decides for all agents, augmented goals if any, and number of the update.
         batch: scenarios with futures.
-        config: Settings of goals, number of rollouts, and seed, which determines goals and rollouts with `update`.
-        augmented: goals beside the logged endpoints, if any.
+        config: Settings of goals, number of rollouts, and seed, which determines goals and rollouts with the update.
         rollout_ids: Rollouts that this process simulates; the rest comes from the processes with the same scenarios.
-        update: Number of the update, from 0.
         fabric: precision of the pass, and the processes.
     """
-    goals = choose_goals(batch, config.goals, augmented, seed=derive_seed(config.seed, "goals", update))
+    goal_seed, seed = (derive_seed(config.seed, purpose, learner.update) for purpose in ("goals", "rollouts"))
+    goals = choose_goals(batch, config.goals, learner.augmented_goals, seed=goal_seed)
     with fabric.autocast(), torch.no_grad(), one_thread():
-        context = policy.encode(batch)
+        context = learner.policy.encode(batch)
         rollouts = simulate(
-            policy, batch, num_rollouts=rollout_ids, seed=derive_seed(config.seed, "rollouts", update),
-            context=context, goals=goals, may_be_nan=True,
-        )  # fmt: skip
+            learner.policy, batch, num_rollouts=rollout_ids, seed=seed, context=context, goals=goals, may_be_nan=True
+        )
     if len(rollout_ids) < config.num_rollouts:
         rollouts = _gather_rollouts(rollouts, config.num_rollouts, fabric)
     return context, rollouts

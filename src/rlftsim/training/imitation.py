@@ -340,19 +340,9 @@ class TargetedRollouts:
     """Type of each agent, which decides the class that its token ids refer to."""
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedLoopPrediction:
-    """A policy's predictions along rollouts, as `imitation.Prediction`."""
-
-    logits: Float[Tensor, "R V"]
-    target: Int64[Tensor, "R"]
-    target_mask: Bool[Tensor, "R"]
-    class_id: Int64[Tensor, "R"]
-
-
 def predict_targets(
     policy: TokenPolicy, context: Any, targeted: TargetedRollouts, trained: Bool[Tensor, "B A"]
-) -> ClosedLoopPrediction:
+) -> Prediction:
     """Predictions along rollouts: differentiable, in a single parallel pass.
 
     Args:
@@ -366,4 +356,4 @@ def predict_targets(
     class_id = class_of_type(targeted.object_type)[:, None, :, None].expand(counts.shape)
     # The distribution has a row for each element of its mask only: pick the same ones, in the same order.
     rows = find_rows(dist.mask, is_dense=len(dist.logits) == dist.mask.numel())
-    return ClosedLoopPrediction(dist.logits, *(values[rows] for values in (targeted.target, counts, class_id)))
+    return Prediction(dist.logits, *(values[rows] for values in (targeted.target, counts, class_id)))

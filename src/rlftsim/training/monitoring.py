@@ -194,21 +194,25 @@ class Validator:
 
     def __init__(self, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric, start: nn.Module | None = None):
         self._scenarios, self.config, self._fabric = scenarios, config, fabric
+        self._choice = config.choose(len(scenarios))
         clusters = getattr(scenarios, "clusters", np.arange(len(scenarios)))  # lists of scenarios name none
-        self._clusters = np.array(clusters)[config.choose(len(scenarios))]
-        if start is not None and len(set(self._clusters)) == 1 and fabric.is_global_zero:
+        self._clusters = np.array(clusters)[self._choice]
+        if start is not None and len(set(self._clusters)) == 1 and fabric.global_rank == 0:
             log.warning("all scenarios of the validation are of one street network: gains hold for it alone.")
-        self._start = None if start is None else validate(start, scenarios, config, fabric)[1]
+        self._start = None if start is None else self._measure(start)[1]
 
     def validate(self, model: nn.Module) -> dict[str, float]:
-        """Metrics of a model, see `validate`; with the gain in RMM over the start, and the lower bound of the gain.
+        """Metrics of a model, with the gain in RMM over the start, and the lower bound of the gain.
+
+        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), where asked for and
+        tokens are predicted the loss and map use on vehicles (`describe_map_use`), and the seconds taken.
 
         Args:
-            model: Policy in training; left unchanged.
+            model: Policy in training; left unchanged, training mode included.
         """
-        from rlftsim.statistics import cluster_bootstrap, mean_interval  # as in `validate`
+        from rlftsim.statistics import cluster_bootstrap, mean_interval  # scipy: time that configurations need not pay
 
-        values, rmm = validate(model, self._scenarios, self.config, self._fabric)
+        values, rmm = self._measure(model)
         if self._start is not None:
             gains = rmm - self._start
             gain = mean_interval(gains, alpha=0.1)
@@ -217,64 +221,39 @@ class Validator:
             values |= {"validation_gain": gain.mean, "validation_gain_low": gain.interval[0]}
         return values
 
+    @torch.no_grad()
+    def _measure(self, model: nn.Module) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
+        """Metrics of a model, and the meta-metric of each selected scenario, NaN where undefined."""
+        from rlftsim.statistics import mean_interval  # as in `validate`
 
-@torch.no_grad()
-def validate(
-    model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric
-) -> tuple[dict[str, float], Float[np.ndarray, "n"]]:
-    """Mean realism of a model's rollouts, and the use of the map; each process takes a part of the scenarios.
-
-    Args:
-        model: Policy; left unchanged, training mode included.
-        scenarios: Held-out scenarios to select from, with futures.
-        config: Number and choice of scenarios and rollouts.
-        fabric: Processes of the run, over which sums are added.
-
-    Returns:
-        1. Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), where asked for
-           and tokens are predicted the loss and map use on vehicles (`MapUse`), and the seconds taken.
-        2. Meta-metric of each selected scenario; NaN where undefined.
-
-    Raises:
-        DataError: A scenario withholds the future.
-    """
-    from rlftsim.statistics import interval_around  # scipy: time that configurations need not pay
-
-    start = time.perf_counter()
-    # A copy, so that neither the mode nor a cache of the model in training changes.
-    frozen: Any = frozen_copy(model)
-    # Dealt out in turn: the same scenarios in total for any number of processes.
-    choice = config.choose(len(scenarios))
-    selected = choice[fabric.global_rank :: fabric.world_size]
-    rmm = torch.zeros(len(choice), dtype=torch.float64, device=fabric.device)
-    positions = torch.arange(len(choice), device=fabric.device)[fabric.global_rank :: fabric.world_size]
-    sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
-    map_use = MapUse.zero(fabric.device) if config.map_use and predicts_tokens(frozen) else None
-    for first in range(0, len(selected), config.scenarios_per_pass):
-        batch = batch_with_futures(scenarios, selected[first : first + config.scenarios_per_pass]).to(fabric.device)
-        with fabric.autocast():
-            rollouts = simulate(
-                frozen, batch, num_rollouts=config.num_rollouts, seed=config.seed, sampling=Sampling(top_k=config.top_k)
-            )
-            if map_use is not None:
-                map_use += measure_map_use(frozen, batch)
-        realism, _ = score_rollouts(batch, rollouts, config.metric)
-        values = torch.stack([getattr(realism, name).double() for name in WATCHED.values()], -1)  # [B, metrics]
-        rmm[positions[first : first + config.scenarios_per_pass]] = values[:, 0]
-        # A scenario may have no finite value of a metric: it is left out of that mean.
-        finite = values.isfinite()
-        values = torch.where(finite, values, 0.0)
-        sums += torch.stack([finite.double(), values, values.square()]).sum(1)
-    count, total, squares = all_reduce_sum(sums, fabric)  # [metrics] each
-    mean = total / count
-    # Standard error of the mean from sums, which can be added over processes; rounding may make it negative.
-    error = ((squares - count * mean.square()).clamp(min=0) / (count - 1) / count).sqrt()
-    low, high = interval_around(float(mean[0]), float(error[0]), int(count[0])).interval
-    logged = dict(zip(WATCHED, mean.tolist())) | {"validation_rmm_low": low, "validation_rmm_high": high}
-    if map_use is not None:
-        logged |= MapUse(all_reduce_sum(map_use.sums, fabric)).to_metrics("validation_")
-    rmm = all_reduce_sum(rmm, fabric).cpu().numpy()
-    return {**logged, "seconds_validation": time.perf_counter() - start}, rmm
+        start, config, fabric = time.perf_counter(), self.config, self._fabric
+        # A copy, so that neither the mode nor a cache of the model in training changes.
+        frozen: Any = frozen_copy(model)
+        # Dealt out in turn; each process fills its rows, and the others add zeros to them.
+        rows = list(range(len(self._choice)))[fabric.global_rank :: fabric.world_size]
+        scores = torch.zeros(len(self._choice), len(WATCHED), dtype=torch.float64, device=fabric.device)
+        measures_map = config.map_use and predicts_tokens(frozen)
+        map_use = torch.zeros(2, 3, dtype=torch.float64, device=fabric.device)
+        for first in range(0, len(rows), config.scenarios_per_pass):
+            selected = rows[first : first + config.scenarios_per_pass]
+            batch = batch_with_futures(self._scenarios, [self._choice[row] for row in selected]).to(fabric.device)
+            with fabric.autocast():
+                rollouts = simulate(
+                    frozen, batch, num_rollouts=config.num_rollouts, seed=config.seed,
+                    sampling=Sampling(top_k=config.top_k),
+                )  # fmt: skip
+                if measures_map:
+                    map_use += measure_map_use(frozen, batch)
+            realism, _ = score_rollouts(batch, rollouts, config.metric)
+            scores[selected] = torch.stack([getattr(realism, name).double() for name in WATCHED.values()], -1)
+        columns = all_reduce_sum(scores, fabric).cpu().numpy().T  # [metrics, scenarios]
+        means = {name: mean_interval(column) for name, column in zip(WATCHED, columns)}
+        low, high = means["validation_rmm"].interval
+        logged = {name: mean.mean for name, mean in means.items()}
+        logged |= {"validation_rmm_low": low, "validation_rmm_high": high}
+        if measures_map:
+            logged |= describe_map_use(all_reduce_sum(map_use, fabric), "validation_")
+        return {**logged, "seconds_validation": time.perf_counter() - start}, columns[0]
 
 
 # ---- map use -------------------------------------------------------------------------------------------------------
@@ -285,36 +264,22 @@ TURNING_RAD = 0.06
 """A token that changes the heading by more than this in its half second is a turning one."""
 
 
-@dataclass(frozen=True, eq=False)
-class MapUse:
-    """Losses of vehicle tokens with and without the map, as sums that add up over batches and processes."""
+def describe_map_use(sums: Float[Tensor, "2 3"], prefix: str = "") -> dict[str, float]:
+    """Mean loss and map use (loss without minus with the map), nats per token, of all and of turning tokens.
 
-    sums: Float[Tensor, "2 3"]
-    """Rows: all tokens, turning tokens. Columns: their number, loss with the map, loss without it (nats), float64."""
+    NaN where there was no such token.
 
-    @classmethod
-    def zero(cls, device: torch.device | str = "cpu") -> "MapUse":
-        """Sums of no token."""
-        return cls(torch.zeros(2, 3, dtype=torch.float64, device=device))
-
-    def __add__(self, addend: "MapUse") -> "MapUse":
-        return MapUse(self.sums + addend.sums)
-
-    def to_metrics(self, prefix: str = "") -> dict[str, float]:
-        """Mean loss and map use (loss without minus with the map), nats per token, of all and of turning tokens.
-
-        NaN where there was no such token.
-
-        Args:
-            prefix: Text before every name.
-        """
-        count, with_map, without = self.sums.T  # [2] each
-        values = {"loss": with_map / count, "map_use": (without - with_map) / count}
-        return {
-            f"{prefix}{name}{suffix}": float(value[row])
-            for name, value in values.items()
-            for row, suffix in enumerate(("", "_turning"))
-        }
+    Args:
+        sums: Results of `measure_map_use`, added over batches and processes.
+        prefix: Text before every name.
+    """
+    count, with_map, without = sums.T  # [2] each
+    values = {"loss": with_map / count, "map_use": (without - with_map) / count}
+    return {
+        f"{prefix}{name}{suffix}": float(value[row])
+        for name, value in values.items()
+        for row, suffix in enumerate(("", "_turning"))
+    }
 
 
 def predicts_tokens(policy: object) -> bool:
@@ -323,12 +288,15 @@ def predicts_tokens(policy: object) -> bool:
 
 
 @torch.no_grad()
-def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
-    """Cross-entropy of the logged vehicles' tokens, with the map and with the map 5 km away.
+def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> Float[Tensor, "2 3"]:
+    """Cross-entropy of the logged vehicles' tokens, with the map and with the map 5 km away, as sums that add up.
 
     Args:
         policy: Policy with a vocabulary, in evaluation mode.
         batch: Scenarios with futures, on the policy's device.
+
+    Returns:
+        Rows: all tokens, turning tokens. Columns: their number, loss with the map, loss without it (nats), float64.
     """
     shifted = []
     for scenario in batch.scenarios:
@@ -337,7 +305,7 @@ def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
     losses, turning = _vehicle_losses(policy, batch)
     without, _ = _vehicle_losses(policy, collate(shifted).to(batch.device))
     columns = torch.stack([torch.ones_like(losses), losses, without], -1).double()  # [r, 3]
-    return MapUse(torch.stack([columns.sum(0), columns[turning].sum(0)]))
+    return torch.stack([columns.sum(0), columns[turning].sum(0)])
 
 
 def _vehicle_losses(policy: PretrainablePolicy, batch: ScenarioBatch) -> tuple[Float[Tensor, "r"], Bool[Tensor, "r"]]:

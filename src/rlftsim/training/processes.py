@@ -57,6 +57,7 @@ def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> 
             "to 1."
         )
     context = multiprocessing.get_context("fork")
+    parts = (fabric.device, fabric.autocast, fabric.backward)
     links: list[Connection] = []
     workers: list[BaseProcess] = []
     try:
@@ -64,7 +65,7 @@ def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> 
             for rank in range(1, processes):
                 link, remote_link = Pipe()
                 links.append(link)
-                process = LinkedProcess(fabric, rank, processes, [remote_link])
+                process = LinkedProcess(*parts, rank, processes, [remote_link])
                 workers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
                 with warnings.catch_warnings():
                     # Of forking beside threads, from Python 3.12 on. A helper uses none of the parent's.
@@ -72,7 +73,7 @@ def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> 
                     workers[-1].start()
                 # Only the helper holds it from here on: its end is the end of the pipe.
                 remote_link.close()
-        yield LinkedProcess(fabric, 0, processes, links)
+        yield LinkedProcess(*parts, 0, processes, links)
     finally:
         for worker in workers:
             worker.kill()  # they write no files, so none is left half-written
@@ -102,41 +103,19 @@ def _help(work: Callable[[Fabric], object], process: "LinkedProcess", inherited:
 class LostProcessError(DataError):
     """A process of the run died."""
 
-    def __init__(self) -> None:
-        super().__init__(
-            "a training process died (out of memory?): run the same command again, it resumes. If that happens again, "
-            "lower micro_batch_size or device.processes."
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class LinkedProcess:
     """A process of several on a CPU, as a `Fabric`."""
 
-    alone: Fabric
-    """Device and precision."""
+    device: torch.device
+    autocast: Callable[[], AbstractContextManager[Any]]
+    backward: Callable[..., None]
+    """These three are those of a process alone."""
     global_rank: int
     world_size: int
     links: Sequence[Connection]
     """Pipes to all other processes in rank 0, to rank 0 in the others."""
-
-    @property
-    def device(self) -> torch.device:
-        """The CPU."""
-        return self.alone.device
-
-    @property
-    def is_global_zero(self) -> bool:
-        """True for the process that forked all other processes."""
-        return self.global_rank == 0
-
-    def autocast(self) -> AbstractContextManager[Any]:
-        """Context in which operations run in the chosen precision."""
-        return self.alone.autocast()
-
-    def backward(self, tensor: Tensor) -> None:
-        """Add the gradient of a scalar to the parameters."""
-        self.alone.backward(tensor)
 
     def all_reduce(self, data: Tensor, *, reduce_op: str) -> Tensor:
         """Sum of a tensor over all processes, the same bits in each process and in each run.
@@ -149,7 +128,7 @@ class LinkedProcess:
             LostProcessError: a process died.
         """
         assert reduce_op == "sum"
-        if not self.is_global_zero:
+        if self.global_rank:
             _send(self.links[0], data)
             return _receive(self.links[0])
         total = data.clone()
@@ -173,7 +152,10 @@ def _receive(link: Connection) -> Tensor:
     try:
         message = link.recv()
     except (EOFError, ConnectionError):
-        raise LostProcessError from None
+        raise LostProcessError(
+            "a training process died (out of memory?): run the same command again, it resumes. If that happens again, "
+            "lower micro_batch_size or device.processes."
+        ) from None
     if isinstance(message, Exception):
         raise message
     return torch.from_numpy(message)

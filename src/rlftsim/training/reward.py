@@ -161,9 +161,7 @@ def update_policy(
     rollout_ids = local_rollouts(config.batch_size, config.num_rollouts, fabric)
     for micro_batch in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
-        context, rollouts = sample_rollouts(
-            learner.policy, micro_batch, config, learner.augmented_goals, rollout_ids, learner.update, fabric
-        )
+        context, rollouts = sample_rollouts(learner, micro_batch, config, rollout_ids, fabric)
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
         realism, rewards = compute_reward(micro_batch, rollouts, config)

@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
 from rlftsim.training.data import share_cache
-from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios
+from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios
 from rlftsim.training.monitoring import Validator, check_validation
 from rlftsim.training.parallel import Fabric, all_reduce_sum, count_processes, forks_processes, num_sharing_memory
 from rlftsim.training.processes import linked_processes
@@ -93,11 +92,9 @@ def train_policy(
         num_updates = settings.num_updates(len(scenarios)) if held_out is not None else 0
         num_updates = min(num_updates, max_updates or num_updates)
         settings = replace(settings, validation=_fit_validation(settings, num_updates, begun_with))
-    work = partial(
-        _make_updates, method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers
-    )
-    with linked_processes(work, settings.device) as fabric:
-        return work(fabric)
+    run = TrainingRun(method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers)
+    with linked_processes(run.work, settings.device) as fabric:
+        return run.work(fabric)
 
 
 def _fit_validation(settings: Any, num_updates: int, begun_with: Mapping[str, Any]) -> Any:
@@ -133,57 +130,6 @@ def _find_method(settings: Any, held_out: TrainingScenarios | None, max_updates:
     return method
 
 
-def _make_updates(
-    method: Method[Any],
-    policy: object,
-    scenarios: Scenarios,
-    out: Path,
-    settings: Any,
-    held_out: Scenarios | None,
-    card: str,
-    max_updates: int | None,
-    on_update: OnUpdate | None,
-    trackers: Collection[str],
-    fabric: Fabric,
-) -> Path:
-    """The model of a run: all updates that are left, in this process.
-
-    Ctrl-C waits for the end of an update, which becomes a checkpoint.
-    """
-    scenarios = share_cache(scenarios, num_sharing_memory(fabric))
-    if held_out is not None and settings.validation.every:
-        check_validation(policy, held_out, settings.validation)
-    else:
-        held_out = None
-    learner = method.start(policy, scenarios, settings, fabric)
-    update_scenarios = UpdateScenarios(scenarios, settings, fabric, learner)
-    with _hold_folder(out, fabric):
-        run = TrainingRun(method.title, scenarios, out, settings, learner, fabric, held_out, max_updates, trackers)
-        validator = None
-        if held_out is not None:
-            # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
-            start = learner.result if settings.validation.paired or settings.validation.keep_best else None
-            validator = Validator(held_out, settings.validation, fabric, start)
-        run.resume()
-        with run.progress() as is_stopped:
-            note = ""
-            while learner.update < run.num_updates:
-                report = method.update(learner, update_scenarios, fabric)
-                ends = learner.update == run.num_updates or bool(report.stop_because)
-                if validator and (ends or validator.config.is_due(learner.update, run.num_updates)):
-                    report.values.update(validator.validate(learner.result))
-                    gain = f" ({gain:+.3f})" if (gain := report.values.get("validation_gain")) is not None else ""
-                    note = f", RMM {report.values['validation_rmm']:.3f}{gain}"
-                    run.keep_best(report.values)
-                is_last = ends or is_stopped()
-                run.finish_update(replace(report, note=report.note + note), is_last=is_last)
-                if on_update is not None and fabric.is_global_zero:
-                    on_update(learner.update, dict(report.values))
-                if is_last:
-                    break
-        return run.finish(card)
-
-
 @contextmanager
 def _hold_folder(out: Path, fabric: Fabric) -> Iterator[None]:
     """Hold the folder of a run, by the process that writes.
@@ -194,7 +140,7 @@ def _hold_folder(out: Path, fabric: Fabric) -> Iterator[None]:
     """
     refusal = None
     with ExitStack() as stack:
-        if fabric.is_global_zero:
+        if fabric.global_rank == 0:
             try:
                 lease = stack.enter_context(Lease(out / ".lock", Inline(), "works in"))
                 stack.callback(lease.remove)
@@ -208,43 +154,83 @@ def _hold_folder(out: Path, fabric: Fabric) -> Iterator[None]:
 
 @dataclass(eq=False)
 class TrainingRun:
-    """A run in a folder, new or resumed.
+    """A run in a folder, new or resumed."""
 
-    Raises:
-        CheckpointError: The folder belongs to a run with other settings or inputs.
-    """
-
-    title: str
-    """Label of the progress bar."""
+    method: Method[Any]
+    policy: object
     scenarios: Scenarios
     """Training scenarios; a different data set or order of scenarios is refused."""
     out: Path
     """Folder of the run."""
-    settings: TrainingSettings
+    settings: Any
     """Settings of the method, stored in the folder."""
-    learner: Learner
-    """Fresh state, brought to the newest checkpoint by `resume`; the policy's fingerprint is a part of the run's
-    identity."""
-    fabric: Fabric
-    """Device and processes; only rank 0 writes files."""
-    held_out: Scenarios | None = None
+    held_out: Scenarios | None
     """Scenarios to validate on."""
-    max_updates: int | None = None
+    card: str
+    """README of the model folder."""
+    max_updates: int | None
     """Updates after which the run ends early."""
-    trackers: Collection[str] = ()
+    on_update: OnUpdate | None
+    trackers: Collection[str]
     """Names of trackers."""
 
-    def __post_init__(self) -> None:
-        learner, is_first = self.learner, self.fabric.is_global_zero
-        total = self.settings.num_updates(len(self.scenarios))
+    def work(self, fabric: Fabric) -> Path:
+        """The model of the run: all updates that are left, in this process.
+
+        Ctrl-C waits for the end of an update, which becomes a checkpoint.
+
+        Args:
+            fabric: Device and processes; only rank 0 writes files.
+
+        Raises:
+            CheckpointError: The folder belongs to a run with other settings or inputs.
+        """
+        self.fabric, self.is_first = fabric, fabric.global_rank == 0
+        self.scenarios = share_cache(self.scenarios, num_sharing_memory(fabric))
+        if self.held_out is not None and self.settings.validation.every:
+            check_validation(self.policy, self.held_out, self.settings.validation)
+        else:
+            self.held_out = None
+        self.learner = learner = self.method.start(self.policy, self.scenarios, self.settings, fabric)
+        update_scenarios = UpdateScenarios(self.scenarios, self.settings, fabric, learner)
+        with _hold_folder(self.out, fabric):
+            self._open()
+            validator = None
+            if self.held_out is not None:
+                # before the weights of a checkpoint are loaded: gains refer to the policy that the run began with
+                config = self.settings.validation
+                start = learner.result if config.paired or config.keep_best else None
+                validator = Validator(self.held_out, config, fabric, start)
+            self.resume()
+            with self.progress() as is_stopped:
+                note = ""
+                while learner.update < self.num_updates:
+                    report = self.method.update(learner, update_scenarios, fabric)
+                    ends = learner.update == self.num_updates or bool(report.stop_because)
+                    if validator and (ends or validator.config.is_due(learner.update, self.num_updates)):
+                        report.values.update(validator.validate(learner.result))
+                        gain = f" ({gain:+.3f})" if (gain := report.values.get("validation_gain")) is not None else ""
+                        note = f", RMM {report.values['validation_rmm']:.3f}{gain}"
+                        self.keep_best(report.values)
+                    is_last = ends or is_stopped()
+                    self.finish_update(replace(report, note=report.note + note), is_last=is_last)
+                    if self.on_update is not None and self.is_first:
+                        self.on_update(learner.update, dict(report.values))
+                    if is_last:
+                        break
+            return self.finish()
+
+    def _open(self) -> None:
+        """Open the folder, and warn of a run that ends in the warm-up."""
+        learner, total = self.learner, self.settings.num_updates(len(self.scenarios))
         self.num_updates = min(total, self.max_updates or total)
         inputs = {**describe_inputs(learner.policy, self.scenarios, self.held_out), **learner.inputs}
-        self.folder = RunFolder(self.out, self.settings, inputs, writes=is_first, may_grow=learner.may_grow)
+        self.folder = RunFolder(self.out, self.settings, inputs, writes=self.is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
         self._best: tuple[float, int] | None = None
         """Lower bound of the gain in the best validation so far, and its update."""
         # Such a run ends with nearly its initial weights, which looks like a method that does not work.
-        if self.num_updates < self.settings.warmup_updates and is_first:
+        if self.num_updates < self.settings.warmup_updates and self.is_first:
             log.warning(
                 f"the run ends after {self.num_updates} of {self.settings.warmup_updates} warm-up updates, so its "
                 "weights hardly move: raise epochs or max_updates, or lower warmup_updates."
@@ -274,11 +260,11 @@ class TrainingRun:
         for values in read_metrics(self.folder.path):
             if values["update"] <= learner.update:  # the process of rank 0 may not have dropped the others yet
                 self._choose_best(values)
-        if self.fabric.is_global_zero and learner.update < self.num_updates:
+        if self.is_first and learner.update < self.num_updates:
             if self.folder.has_model:
                 log.info(f"{self.folder.model} stays the model of the shorter run until this one ends.")
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
-            log.info(f"{self.title} {begun}: {self.num_updates} updates of {_count_weights(learner)}.")
+            log.info(f"{self.method.title} {begun}: {self.num_updates} updates of {_count_weights(learner)}.")
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[], bool]]:
@@ -290,11 +276,10 @@ class TrainingRun:
         Raises:
             KeyboardInterrupt: Ctrl-C or a similar signal, when the update is done.
         """
-        waits = self.fabric.world_size == 1 or forks_processes(self.settings.device)
-        is_shown = self.fabric.is_global_zero
+        title, waits = self.method.title, self.fabric.world_size == 1 or forks_processes(self.settings.device)
         try:
             with (
-                progress_bar(self.title, self.num_updates, self.learner.update, show=is_shown) as self._advance,
+                progress_bar(title, self.num_updates, self.learner.update, show=self.is_first) as self._advance,
                 ctrl_c_waits(enabled=waits) as is_stopped,
             ):
                 yield is_stopped
@@ -314,7 +299,7 @@ class TrainingRun:
         Args:
             values: Metrics of the update, those of its validation included.
         """
-        if self._choose_best({**values, "update": self.learner.update}) and self.fabric.is_global_zero:
+        if self._choose_best({**values, "update": self.learner.update}) and self.is_first:
             self.folder.write_best(self.learner.update, self.learner.result)
 
     def _choose_best(self, values: Mapping[str, Any]) -> bool:
@@ -340,7 +325,7 @@ class TrainingRun:
         learner = self.learner
         # The line is written first, so that a run that ends here shows why.
         self.folder.log(learner.update, report.values)
-        if self.fabric.is_global_zero:
+        if self.is_first:
             if learner.skipped_in_a_row:
                 limit = f"{learner.skipped_in_a_row} in a row, the run stops at {self.settings.max_skipped_in_a_row}"
                 log.warning(f"update {learner.update} skipped: {report.skipped_because} ({limit})")
@@ -351,7 +336,7 @@ class TrainingRun:
         # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
         is_due = (is_last or learner.update % self.settings.checkpoint_every == 0) and not learner.skipped_in_a_row
         self._check_divergence(report, has_checked_weights=is_due)
-        if is_due and self.fabric.is_global_zero:
+        if is_due and self.is_first:
             numbers = learner.to_numbers() | ({STOPPED: 1.0} if report.stop_because else {})
             progress = Progress(learner.update, numbers)
             write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
@@ -370,20 +355,16 @@ class TrainingRun:
         if has_checked_weights and not (math.isfinite(loss) and all(p.isfinite().all() for p in learner.parameters)):
             raise self.folder.diverged("the loss or a weight is not finite any more", learner.remedy)
 
-    def finish(self, card: str) -> Path:
-        """Save the trained policy, and return the model folder.
-
-        Args:
-            card: README of the model folder.
-        """
+    def finish(self) -> Path:
+        """Save the trained policy, and return the model folder."""
         learner = self.learner
         learner.finish()
         self._take_best()
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds
             learner.policy.load_state_dict(learner.result.state_dict())
-        if self.fabric.is_global_zero:
-            learner.policy.eval().save_pretrained(self.folder.model, card=card)
+        if self.is_first:
+            learner.policy.eval().save_pretrained(self.folder.model, card=self.card)
         self.folder.finish_trackers("finished")
         return self.folder.model
 
@@ -394,7 +375,7 @@ class TrainingRun:
         bound, update = self._best
         if update != self.learner.update:
             self.folder.load_best(update, self.learner.result)
-        if not self.fabric.is_global_zero:
+        if not self.is_first:
             return
         log.info(
             f"{self.folder.model} is the model of update {update}: the lower bound of its gain in RMM over the start, "

@@ -212,10 +212,9 @@ class RunFolder:
         path = self._best(update)
         way_out = f"remove {self.path} and train again"
         try:
-            weights, _ = read_tensors(path, way_out, error=CheckpointError)
+            missing = f"{path} is missing, the weights of the best validation: {way_out}."
+            weights, _ = read_tensors(path, way_out, error=CheckpointError, missing=missing)
             check_weights(path.stem, weights, model)
-        except FileNotFoundError:
-            raise CheckpointError(f"{path} is missing, the weights of the best validation: {way_out}.") from None
         except ValueError as error:
             raise CheckpointError(f"{path}: {error}: {way_out}.") from None
         model.load_state_dict(weights)

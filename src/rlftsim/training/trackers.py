@@ -67,7 +67,7 @@ class Tracker(Protocol):
         ...
 
     def artifact(self, path: str, kind: str) -> None:
-        """Add a result of the run.
+        """Add a result of the run; not for trackers that keep no files.
 
         Args:
             path: Folder of the files, such as the trained model's.
@@ -80,7 +80,7 @@ class Tracker(Protocol):
         ...
 
 
-class TensorBoardTracker:
+class TensorBoardTracker(Tracker):
     """Events in the folder `tensorboard` of the run."""
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> None:
@@ -98,9 +98,6 @@ class TensorBoardTracker:
                 write_settings(self._board, self._config)
         for name, value in values.items():
             self._board.add_scalar(board_tag(name), value, step)
-
-    def artifact(self, path: str, kind: str) -> None:
-        """No file is kept: TensorBoard shows none."""
 
     def finish(self, status: Status) -> None:
         """Pending events are written."""
@@ -165,7 +162,7 @@ class MlflowTracker:
         self._mlflow.end_run({"finished": "FINISHED", "stopped": "KILLED", "failed": "FAILED"}[status])
 
 
-class TrackioTracker:
+class TrackioTracker(Tracker):
     """Trackio: a file of SQLite on this machine, in the folder that TRACKIO_DIR names."""
 
     def start(self, run: str, config: dict[str, Any], resume: str | None) -> str:
@@ -182,9 +179,6 @@ class TrackioTracker:
     def log(self, values: Mapping[str, float], step: int) -> None:
         """A row of the run."""
         self._run.log(dict(values), step=step)
-
-    def artifact(self, path: str, kind: str) -> None:
-        """No file is kept: models stay in the folder of the run."""
 
     def finish(self, status: Status) -> None:
         """Pending rows are written."""

@@ -180,4 +180,5 @@ def pretrain(
 def _to_recipe_like(recipe: Recipe, policy: Policy) -> Recipe:
     """Recipe for policies of the sizes of an existing one."""
     # A recipe of another package may know no models but its own: those are trained further as they are.
-    return recipe if type(recipe).like is Recipe.like else recipe.like(policy)
+    has_one_size = recipe.policy_type is None and type(recipe).like is Recipe.like
+    return recipe if has_one_size else recipe.like(policy)

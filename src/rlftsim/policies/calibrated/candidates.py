@@ -422,11 +422,8 @@ class Candidates:
     @cached_property
     def _bounds(self) -> tuple[Float[Tensor, "R 2"], Float[Tensor, "R 2"]]:
         """Least and greatest x and y of the ends of each agent's tokens."""
-        ends, row, infinite = (
-            self.end[:, :2],
-            self.row[:, None].expand(-1, 2),
-            torch.full_like(self._position, torch.inf),
-        )
+        ends, row = self.end[:, :2], self.row[:, None].expand(-1, 2)
+        infinite = torch.full_like(self._position, torch.inf)
         return infinite.scatter_reduce(0, row, ends, "amin"), (-infinite).scatter_reduce(0, row, ends, "amax")
 
     @cached_property

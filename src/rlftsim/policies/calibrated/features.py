@@ -27,7 +27,7 @@ from torch import Tensor
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.policies.calibrated.candidates import SUPPORT_NATS, Candidates, Scene, Traffic
-from rlftsim.policies.distributions import CategoricalDistribution
+from rlftsim.policies.distributions import FULL, CategoricalDistribution
 from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.rows import find_rows
 from rlftsim.tokens.vocabulary import Vocabulary
@@ -170,6 +170,8 @@ class TiltedDistribution(CategoricalDistribution):
     """
 
     base: CategoricalDistribution
+    mask: Bool[Tensor, "*batch"]
+    """That of the base, True = the element decides; as is the sampling."""
     eta: Float[Tensor, "K"]
     features: Sequence[Feature]
     scene: Scene
@@ -177,16 +179,7 @@ class TiltedDistribution(CategoricalDistribution):
     vocabulary: Vocabulary
     seconds: float
     """Duration of a decision."""
-
-    @property
-    def mask(self) -> Bool[Tensor, "*batch"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """True = the element decides."""
-        return self.base.mask
-
-    @property
-    def sampling(self) -> Sampling:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the base."""
-        return self.base.sampling
+    sampling: Sampling = FULL
 
     @cached_property
     def logits(self) -> Float[Tensor, "R V"]:

@@ -379,4 +379,5 @@ class CalibratedPolicy(nn.Module):
         return self.steps_per_decision * STEP_S
 
     def _tilt(self, scene: Scene, dist: Any, traffic: Traffic) -> TiltedDistribution:
-        return TiltedDistribution(dist, self.eta, self._features, scene, traffic, self.vocabulary, self._seconds)
+        values = (self.eta, self._features, scene, traffic, self.vocabulary, self._seconds)
+        return TiltedDistribution(dist, dist.mask, *values, dist.sampling)

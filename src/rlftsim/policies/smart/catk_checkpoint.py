@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError, DataError, printable
-from rlftsim.jobs.arrays import read_npz, read_tensors
+from rlftsim.jobs.arrays import find_misfits, read_npz, read_tensors
 from rlftsim.jobs.documents import first_line
 from rlftsim.jobs.files import save_tensors, write_atomically
 from rlftsim.policies.checkpoint import join_first, outline, strip_wrappers
@@ -144,11 +144,8 @@ def build_catk_vocabulary(tables: dict[str, np.ndarray], source: str, *, num_map
 
 def has_published_tokens(vocabulary: Vocabulary) -> bool:
     """True if the motion tokens are those that CAT-K published, by sha256."""
-    tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
-    return all(
-        hashlib.sha256(np.ascontiguousarray(t, np.float32).tobytes()).hexdigest() == _PUBLISHED[name]
-        for name, t in tables.items()
-    )
+    tables = (np.ascontiguousarray(table, np.float32).tobytes() for table in vocabulary.corners.cpu().numpy())
+    return [hashlib.sha256(table).hexdigest() for table in tables] == [_PUBLISHED[name] for name in MOTION_TABLES]
 
 
 def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
@@ -421,10 +418,8 @@ def write_catk(policy: SmartPolicy, path: Path) -> None:
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by the public code's names, and the file's settings of the decoder and the tokens, empty without any."""
     if path.suffix == ".safetensors":
-        try:
-            weights, settings = read_tensors(path, "get the file again", error=CheckpointError)[0], {}
-        except FileNotFoundError:
-            raise CheckpointError(f"{path}: no such file.") from None
+        missing, settings = f"{path}: no such file.", {}
+        weights, _ = read_tensors(path, "get the file again", error=CheckpointError, missing=missing)
     else:
         weights, settings = read_lightning(path)
     weights = dict(strip_wrappers(weights, ()))
@@ -487,22 +482,15 @@ def _translate(weights: dict[str, Tensor], expected: dict[str, Tensor], source: 
         CheckpointError: Weights are missing, unknown, of the wrong shape or type, or unequal under a second name; the
             first are named.
     """
-    # shapes of all names that must be there, second names of shared norms included
+    # all names that must be there, second names of shared norms included
     keys = {catk_name(key): key for key in expected}
     aliases = find_aliases(keys)
-    shapes = {name: expected[key].shape for name, key in keys.items()}
-    shapes |= {second: shapes[first] for second, first in aliases.items()}
+    named = {name: expected[key] for name, key in keys.items()}
+    named |= {second: named[first] for second, first in aliases.items()}
     # collect all problems, so that a user mends them at once
-    problems = [f"missing {name}" for name in sorted(shapes.keys() - weights.keys())]
-    problems += [f"unknown {name[:100]}" for name in sorted(weights.keys() - shapes.keys())]
-    for name in sorted(shapes.keys() & weights.keys()):
-        value = weights[name]
-        if value.shape != shapes[name]:
-            problems.append(f"{name} has shape {tuple(value.shape)} instead of {tuple(shapes[name])}")
-        elif value.dtype != torch.float32:
-            problems.append(f"{name} is {value.dtype} instead of torch.float32")
-        elif not value.isfinite().all():
-            problems.append(f"{name} holds values that are not finite")
+    problems = find_misfits(weights, named)
+    is_broken = {name: not weights[name].isfinite().all() for name in sorted(named.keys() & weights.keys())}
+    problems += [f"{name} holds values that are not finite" for name, broken in is_broken.items() if broken]
     for second, first in sorted(aliases.items()):
         if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
             problems.append(f"{second} differs from {first}, which must be the same")

@@ -178,7 +178,6 @@ class SmartModel(nn.Module):
             folder: Folder of the model, created where it is missing.
             card: Text of README.md, in Markdown; empty = a line that names no origin.
         """
-        card = card or "A SMART traffic model. Origin unknown.\n"
         config = asdict(self.config) | ({} if self.sampling.is_full else {"sampling": asdict(self.sampling)})
         extra = {VOCABULARY: self.vocabulary.to("cpu").save}
         save_model(folder, self, config, card=card, weights=self.network.state_dict(), extra=extra)

@@ -22,7 +22,7 @@ from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import Past, Scene, View
 from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere
-from rlftsim.rollout.policy import DecisionDistribution
+from rlftsim.rollout.policy import DecisionDistribution, Prediction
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -91,19 +91,6 @@ class State:
     cache: DecoderCache = field(default_factory=DecoderCache)
 
 
-@dataclass(frozen=True, eq=False)
-class TeacherForced:
-    """Predictions along logged tracks, and the tokens of the log."""
-
-    logits: Float[Tensor, "R V"]
-    target: Int64[Tensor, "R"]
-    """Token that came next."""
-    target_mask: Bool[Tensor, "R"]
-    """True = the next state was logged and the agent is trained on."""
-    class_id: Int64[Tensor, "R"]
-    """Agent class that each row's token ids refer to."""
-
-
 class SmartPolicy(SmartModel):
     """Next-token traffic model of all agents of a scenario.
 
@@ -166,13 +153,8 @@ class SmartPolicy(SmartModel):
         if goals is None or not self.is_goal_conditioned or not goals.any:
             return State(position, heading, context.past.repeat(num_rollouts), pending=None)
         # the context is goal-free: the current step goes through the decoder again, with goals; earlier steps do not
-        return State(
-            position,
-            heading,
-            context.past.without_last_step().repeat(num_rollouts),
-            pending=current,
-            goals=encode_goals(goals, context.scene.map_positions),
-        )
+        past = context.past.without_last_step().repeat(num_rollouts)
+        return State(position, heading, past, current, goals=encode_goals(goals, context.scene.map_positions))
 
     def decide(self, context: Context, state: State) -> TokenDistribution:
         """Distributions [B, N, A] of the next token of every agent.
@@ -262,10 +244,8 @@ class SmartPolicy(SmartModel):
         # 2. distributions of the agents; padding is left out
         mask = context.agent_mask[:, None, :, None].expand(features.shape[:4])
         num_left = (NUM_DECISIONS - torch.arange(mask.shape[3], device=mask.device)).expand(mask.shape)
-        poses = None
-        if state.goals is not None:
-            assert state.pending is not None  # with goals even the current step was pending
-            poses = Poses(state.pending.position, state.pending.heading)
+        # with goals even the current step was pending
+        poses = None if state.pending is None else Poses(state.pending.position, state.pending.heading)
         return self._build_distribution(context, state, features[mask], mask, poses, num_left)
 
     # ---- passes that share scenes and views -------------------------------------------------------------------------
@@ -307,7 +287,7 @@ class SmartPolicy(SmartModel):
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
-    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> TeacherForced:
+    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
         """Predict every next token along the logged tracks.
 
         Args:
@@ -329,7 +309,7 @@ class SmartPolicy(SmartModel):
         class_id = class_of_type(scenarios.object_type)
         logits = self._predict(scene, rows[decides[steps.valid]], class_id, decides).logits
         class_id = class_id[:, None, :, None].expand(decides.shape)[decides]
-        return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
+        return Prediction(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
     # ---- passes of the decoder and the head -----------------------------------------------------------------------
 

@@ -108,11 +108,6 @@ class TrafficBotsConfig:
             raise ConfigError(f"forced_fractions are one or more fractions in [0, 1], got {fractions}.")
 
 
-def trafficbots_v15() -> TrafficBotsConfig:
-    """TrafficBots V1.5."""
-    return TrafficBotsConfig()
-
-
 def trafficbots_demo() -> TrafficBotsConfig:
     """A model small enough to train on two CPU cores in minutes, with noise that its kinematics gain by.
 

@@ -372,7 +372,6 @@ class TrafficBotsPolicy(nn.Module):
             folder: Folder of the model, created where it is missing.
             card: Text of README.md; empty = a line that says that the origin is unknown.
         """
-        card = card or "A TrafficBots traffic model. Origin unknown.\n"
         save_model(folder, self, asdict(self.config), card=card, weights=self.network.state_dict())
 
     @classmethod

@@ -8,7 +8,7 @@ without tokens has padding.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -138,10 +138,6 @@ class Scene:
         """Pose of each light: the pose of the light's map token."""
         return self.map_pose.gather(1, self.light_token[..., None].expand(-1, -1, 3))
 
-    def to(self, device: torch.device) -> "Scene":
-        """The same scene on a device."""
-        return Scene(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
     def to_batch_frame(self, pose: Float[Tensor, "B N A 3"]) -> Float[Tensor, "B N A 3"]:
         """Poses of the ego frame in the frame of the batch, headings in [-pi, pi)."""
         origin = self.origin[:, None, None]  # [B, 1, 1, 3]
@@ -169,9 +165,8 @@ def build_scene(batch: ScenarioBatch, num_steps: int, max_map_tokens: int | None
     counts = {name: pad["node_mask"] for name in ("node_pose", "node_mask", "map_type")}
     counts |= {name: pad["light_token"] for name in ("light_token", "light_mask", "light_state")}
     counts |= {name: batch.agent_mask.shape[1] for name in ("size", "valid", "pose", "motion")}
-    stacked = {name: _stack([row[name] for row in rows], counts.get(name)) for name in rows[0]}
-    scene = Scene(**stacked, agent_mask=batch.agent_mask, agent_class=class_of_type(batch.object_type))
-    return scene.to(batch.device)
+    stacked = {name: _stack([row[name] for row in rows], counts.get(name)).to(batch.device) for name in rows[0]}
+    return Scene(**stacked, agent_mask=batch.agent_mask, agent_class=class_of_type(batch.object_type))
 
 
 def _stack(arrays: Sequence[np.ndarray], count: int | None) -> Tensor:
