@@ -14,7 +14,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rlftsim.errors import DataError, RlftsimError
+from rlftsim.errors import DataError
 from rlftsim.jobs.documents import check_has_end, explained_damage, first_line
 
 MAX_VALUES = 1 << 25
@@ -30,23 +30,19 @@ _ARROW_BEGINNING = b"ARROW1\0\0"
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, pa.ArrowException)
 
 
-def read_parquet(
-    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
-) -> pa.Table:
+def read_parquet(path: str | PathLike[str], remedy: str, *, missing: str = "") -> pa.Table:
     """Validated table of a Parquet file.
 
     Args:
         path: Parquet file; a folder is none.
         remedy: Way out at the end of every message, such as "convert again".
-        error: Class of the errors raised.
         missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
         FileNotFoundError: No such file, and no message for that.
-        RlftsimError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can
-            explain.
+        DataError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can explain.
     """
-    with explained_damage(path, _DAMAGE, remedy, describe=_describe_cause, error=error, missing=missing):
+    with explained_damage(path, _DAMAGE, remedy, describe=_describe_cause, missing=missing):
         num_bytes = stat(path).st_size
         with _limited_memory(MAX_TABLE_BYTES + MAX_BYTES_PER_BYTE * num_bytes), pq.ParquetFile(path) as file:
             _check_size(file.metadata, num_bytes)
