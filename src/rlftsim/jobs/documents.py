@@ -102,10 +102,7 @@ def parse_json(
     def parse(decoded: str) -> Any:
         try:
             value = json.loads(
-                decoded,
-                parse_float=None if allow_nan else parse_float,
-                parse_constant=parse_float,
-                parse_int=parse_int,
+                decoded, parse_float=None if allow_nan else parse_float, parse_constant=parse_float, parse_int=parse_int
             )
             # every name has a colon; more of them are in texts, or behind a name that is written twice
             if _count_names(value) < decoded.count(":"):

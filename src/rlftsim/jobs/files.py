@@ -140,8 +140,7 @@ def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:
     """True for a temporary file of one of the names whose writer has ended, or is on another machine."""
     name = name_and_host.removesuffix(f".{socket.gethostname()}")
     if name == name_and_host:  # of another machine, whose name may have dots as the file's may
-        words = name.split(".")
-        return any(".".join(words[:number]) in names for number in range(1, len(words)))
+        return any(name.startswith(f"{output}.") for output in names)
     is_asked = process != os.getpid() and os.name == "posix"  # elsewhere the question ends the process
     return name in names and not (is_asked and _is_running(process))
 
