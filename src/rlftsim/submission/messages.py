@@ -164,6 +164,8 @@ def _decode_uniform(data: bytes, challenge: Challenge) -> DecodedRollouts | None
         fields = read_fields(BytesIO(data), len(data))
         name, scene = next(fields), next(fields)
         agents = submission_pb2.JointScene.FromString(scene.payload).simulated_trajectories
+        if len(agents) * count_bytes(challenge) > len(scene.payload):  # too short for their numbers
+            return None
         object_ids = tuple(agent.object_id for agent in agents)
         layout, starts = _lay_out_scene(object_ids, [agent.object_type for agent in agents], challenge)
         offset = len(name.head) + len(name.payload)
