@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import rlftsim
-from rlftsim.errors import CheckpointError, DataError
+from rlftsim.errors import DataError
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import check_columns, map_arrow, read_parquet, read_parquet_metadata
 
@@ -168,8 +168,8 @@ def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tm
 
 def test_damage_is_one_line_and_a_missing_file_is_the_callers_to_explain(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR1 nonsense PAR1")
-    with pytest.raises(CheckpointError, match=r"a\.parquet: cannot be read \(.*\): write it again\.$") as error:
-        read_parquet(tmp_path / "a.parquet", "write it again", error=CheckpointError)
+    with pytest.raises(DataError, match=r"a\.parquet: cannot be read \(.*\): write it again\.$") as error:
+        read_parquet(tmp_path / "a.parquet", "write it again")
     assert "\n" not in str(error.value)
     assert read_parquet_metadata(tmp_path / "a.parquet") == {}
     for read in (read_parquet, map_arrow):

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from rlftsim.errors import DataError
@@ -106,10 +105,9 @@ def test_only_a_full_disk_needs_room(tmp_path):
 @pytest.mark.parametrize("cause", [errno.EACCES, errno.EROFS])
 def test_a_place_where_tensors_may_not_be_written_needs_no_room(cause, tmp_path, monkeypatch):
     def refused(*_, **__):
-        text = f'{os.strerror(cause)} (os error {cause}) at path "{tmp_path}/.tmpKuy0Um"'
-        raise SafetensorError(f"Error while serializing: I/O error: {text}")
+        raise OSError(cause, os.strerror(cause))
 
-    monkeypatch.setattr("rlftsim.jobs.files.save_file", refused)
+    monkeypatch.setattr(Path, "write_bytes", refused)
     with pytest.raises(DataError, match=rf"safetensors \({os.strerror(cause)}\): choose another place, then run"):
         save_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(3)})
 

@@ -171,7 +171,7 @@ def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
     owner = (
         rf"another process is copying to {url} \(.* process {os.getpid()}, last heard of 0:00:0\d ago\): wait for it,"
     )
-    with remote_lease(url, "is copying to") as renew:
+    with remote_lease(url) as renew:
         renew()
         with pytest.raises(NotYetError, match=owner + rf" or remove {url}/\.lease if it is gone"):
             push_dataset(data, url, show_progress=False)
@@ -186,7 +186,7 @@ def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
 
 def test_a_push_that_was_taken_over_leaves_the_new_owner_alone(tmp_path):
     url, other = f"file://{tmp_path}", "other process 1 since 2026-01-01T00:00:00+00:00\n"
-    with remote_lease(url, "is copying to") as renew:
+    with remote_lease(url) as renew:
         buckets.put_text(f"{url}/.lease", other, is_new=False)
         with pytest.raises(NotYetError, match=f"other process 1 has taken over {url}"):
             renew()

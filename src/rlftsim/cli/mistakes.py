@@ -56,17 +56,14 @@ def nearest(flag: str, flags: Sequence[str]) -> str | None:
     """
     group, _, last = flag.removeprefix("--").rpartition(".")
     siblings = [name for name in flags if name.removeprefix("--").rpartition(".")[0].startswith(group)]
-    by_last = {name: name.removeprefix("--").rpartition(".")[2] for name in siblings}
     # 1. the right name without its group, 2. initials, 3. a typing mistake in the last part, 4. one anywhere
-    for fits in (lambda name: name == last, lambda name: "".join(word[:1] for word in name.split("-")) == last):
-        match = next((flag for flag, name in by_last.items() if fits(name)), None)
-        if match:
-            return match
-    close = difflib.get_close_matches(last, list(by_last.values()), n=1, cutoff=0.75)
-    if close:
-        return next(flag for flag, name in by_last.items() if name == close[0])
-    if group and siblings:  # the group is right: a flag of another one would be a wild guess
-        return None
+    parts = [(name.removeprefix("--").rpartition(".")[2], name) for name in reversed(siblings)]  # the first one stays
+    by_last = dict(parts)
+    by_initials = {"".join(word[:1] for word in part.split("-")): name for part, name in parts}
+    close = [by_last[part] for part in difflib.get_close_matches(last, by_last, n=1, cutoff=0.75)]
+    match = by_last.get(last) or by_initials.get(last) or next(iter(close), None)
+    if match or (group and siblings):  # the group is right: a flag of another one would be a wild guess
+        return match
     # without the hyphens, which all have in common: "--limit" is not "--split"
     names = [name.removeprefix("--") for name in flags]
     return next((f"--{name}" for name in difflib.get_close_matches(flag.removeprefix("--"), names, 1, 0.65)), None)

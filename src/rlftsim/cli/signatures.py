@@ -27,11 +27,8 @@ class Call:
     @property
     def arguments(self) -> dict[str, Any]:
         """Values of the verb's own arguments."""
-        return {
-            name: self.values[name]
-            for name in inspect.signature(self.command.function).parameters
-            if name in self.values
-        }
+        names = inspect.signature(self.command.function).parameters
+        return {name: self.values[name] for name in names if name in self.values}
 
     def show(self, result: Any) -> int:
         """Print the verb's result; returns the exit status."""

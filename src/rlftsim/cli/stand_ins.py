@@ -28,27 +28,26 @@ SLOW = (
 )
 
 
-class _AnyClass(type):
-    """Class of a stand-in: attributes and unions of it are stand-ins, too."""
+class _StandIn:
+    """What stands for a class or a value: it has any attribute, and nothing inside."""
 
-    def __getattr__(cls, name: str) -> Any:
+    def __getattr__(self: Any, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
         return _Anything
 
-    def __or__(cls, other: object) -> Any:
-        return _Anything
-
-    __ror__ = __or__
-
-    def __iter__(cls) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[Any]:
         return iter(())
 
-    def __len__(cls) -> int:
+    def __len__(self) -> int:
         return 0
 
 
-class _Anything(metaclass=_AnyClass):
+class _AnyClass(_StandIn, type):
+    """Class of a stand-in: attributes and unions of it are stand-ins, too."""
+
+
+class _Anything(_StandIn, metaclass=_AnyClass):
     """Stands for any class, function, constant or decorator of a slow library."""
 
     def __new__(cls, *arguments: Any, **options: Any) -> Any:
@@ -63,28 +62,17 @@ class _Anything(metaclass=_AnyClass):
     def __class_getitem__(cls, item: object) -> type:
         return cls
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return _Anything
-
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         return _Anything(*arguments, **options)
 
     def __getitem__(self, item: object) -> Any:
         return self
 
-    def __iter__(self) -> Iterator[Any]:
-        return iter(())
-
-    def __len__(self) -> int:
-        return 0
-
     def __float__(self) -> float:
         return 0.0
 
 
-for _operation in ("mul", "truediv", "floordiv", "sub", "add"):
+for _operation in ("mul", "truediv", "floordiv", "sub", "add", "or"):
     for _name in (f"__{_operation}__", f"__r{_operation}__"):
         setattr(_AnyClass, _name, lambda self, other: _Anything)
         setattr(_Anything, _name, lambda self, other: self)
@@ -92,11 +80,7 @@ for _operation in ("mul", "truediv", "floordiv", "sub", "add"):
 
 class _EmptyModule(ModuleType):
     __path__: Sequence[str] = ()
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return _Anything
+    __getattr__ = _StandIn.__getattr__
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.errors import DataError, RlftsimError
-from rlftsim.jobs.documents import check_has_end, first_line
+from rlftsim.jobs.documents import explained_damage, first_line
 
 MAX_ARRAY_BYTES = 1 << 30
 """Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
@@ -44,16 +44,12 @@ def read_tensors(
         FileNotFoundError: No such file, without `missing`; the caller names the file in the message.
         RlftsimError: Damaged file, or no such file.
     """
-    try:
-        check_has_end(path)
-        with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-    except FileNotFoundError:
-        if missing:
-            raise error(missing) from None
-        raise
-    except _TENSOR_DAMAGE as problem:
-        raise error(f"{path}: damaged safetensors file ({first_line(problem)}): {remedy}.") from None
+    words = ": damaged safetensors file"
+    with (
+        explained_damage(path, _TENSOR_DAMAGE, remedy, words=words, error=error, missing=missing),
+        safe_open(path, "pt") as file,
+    ):
+        return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 
 
 def find_misfits(
@@ -94,25 +90,25 @@ def read_npz(
         RlftsimError: No npz, damaged, an array of Python objects, or an array that unfolds to more than
             `MAX_ARRAY_BYTES`.
     """
-    try:
-        check_has_end(path)
-        # numpy and Python warn of odd headers
-        with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(path) as archive:
-            members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
-            sizes = {name: _read_header(archive, member) for name, member in members.items()}
-            if sum(sizes.values()) > MAX_ARRAY_BYTES:
-                raise ValueError(f"its arrays unfold to {sum(sizes.values()) / 1e9:.3g} GB")
-            arrays = {}
-            for name, member in members.items():
-                with archive.open(member) as file:
-                    arrays[name] = np.lib.format.read_array(file, allow_pickle=False)  # pyright: ignore
-            return arrays
-    except FileNotFoundError:
-        raise
-    except _ARRAY_DAMAGE as problem:
-        is_cut = isinstance(problem, zipfile.BadZipFile | EOFError)
-        cause = "it is not an npz archive, or cut off" if is_cut else first_line(problem)
-        raise error(f"{path}: cannot be read ({cause}): {remedy}.") from None
+    with (
+        explained_damage(path, _ARRAY_DAMAGE, remedy, describe=_describe_cause, error=error),
+        warnings.catch_warnings(action="ignore"),  # numpy and Python warn of odd headers
+        zipfile.ZipFile(path) as archive,
+    ):
+        members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
+        num_bytes = sum(_read_header(archive, member) for member in members.values())
+        if num_bytes > MAX_ARRAY_BYTES:
+            raise ValueError(f"its arrays unfold to {num_bytes / 1e9:.3g} GB")
+        arrays = {}
+        for name, member in members.items():
+            with archive.open(member) as file:
+                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)  # pyright: ignore
+        return arrays
+
+
+def _describe_cause(problem: BaseException) -> str:
+    is_cut = isinstance(problem, zipfile.BadZipFile | EOFError)
+    return "it is not an npz archive, or cut off" if is_cut else first_line(problem)
 
 
 def _read_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:

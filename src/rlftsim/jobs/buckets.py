@@ -9,13 +9,13 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import timedelta
 from fnmatch import fnmatchcase
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
+from rlftsim.jobs.documents import first_line
 from rlftsim.jobs.files import NO_ROOM, errors_name, remove_temporaries, temporary_path, write_atomically, write_text
 from rlftsim.jobs.folder import describe_owner, parse_owner
 from rlftsim.jobs.progress import log
@@ -81,16 +81,6 @@ def cache_folder() -> Path:
     return Path(os.environ.get("RLFTSIM_CACHE", "~/.cache/rlftsim")).expanduser()
 
 
-def local_copy(url: str, section: str) -> Path:
-    """Local folder that stands for an address.
-
-    Args:
-        url: Address of a remote folder, with or without a slash at the end.
-        section: Folder of the cache in which all such folders lie, such as "data".
-    """
-    return cache_folder() / section / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
-
-
 @contextmanager
 def remote(url: str) -> Iterator[tuple[Any, str]]:
     """File system and path of an address; errors inside the block become a single line that names the address.
@@ -119,10 +109,9 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
             raise DataError(
                 f"cannot write {url} ({error.strerror}): make room there, then run the same command again."
             ) from None
-        cause = (str(error).strip().splitlines() or [""])[0].rstrip(".")
         raise DataError(
-            f"{url}: {type(error).__name__}: {cause}: check the address, the network and the credentials of this "
-            "machine (docs/machines.md, Buckets)."
+            f"{url}: {type(error).__name__}: {first_line(error)}: check the address, the network and the credentials "
+            "of this machine (docs/machines.md, Buckets)."
         ) from error
 
 
@@ -297,7 +286,8 @@ def mirror(url: str, names: tuple[str, ...]) -> Path:
     Raises:
         DataError: A file is missing.
     """
-    folder, url = local_copy(url, "data"), url.rstrip("/")
+    url = url.rstrip("/")
+    folder = cache_folder() / "data" / hashlib.sha256(url.encode()).hexdigest()[:16]
     with _locked(folder / ".lock"):
         new = folder / f"{names[-1]}.new"
         remove_temporaries([new, *(folder / name for name in (*names, ORIGIN))])
@@ -336,15 +326,14 @@ def find_files(url: str, pattern: str) -> dict[str, int]:
 
 
 @contextmanager
-def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
-    """Hold a remote folder for the time of a block; yields a function to be called every few minutes meanwhile.
+def remote_lease(url: str) -> Iterator[Callable[[], object]]:
+    """Hold a remote folder while it is copied to; yields a function to be called every few minutes meanwhile.
 
     Buckets have no locks. So the owner and the time are in a file that only a single process can create. The file
     counts until removed, or until not renewed for `SECONDS_OF_SILENCE`.
 
     Args:
         url: Address of the folder, without a slash at the end.
-        doing: Verb of the work, for messages: "is copying to".
 
     Raises:
         NotYetError: A second process holds the folder, or took the folder over after a long silence of this process.
@@ -362,15 +351,12 @@ def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
         put_text(lease_url, describe_owner(), is_new=False)
 
     while not put_text(lease_url, describe_owner(), is_new=True):
-        text = get_text(lease_url)
-        try:
-            owner, age = parse_owner(text)
-        except (ValueError, TypeError):  # it is only just beginning, or was damaged
-            owner, age = "unknown", timedelta()
+        owner, age = parse_owner(get_text(lease_url))
+        owner = owner or "unknown"
         if age.total_seconds() < SECONDS_OF_SILENCE:
             raise NotYetError(
-                f"another process {doing} {url} ({owner}, last heard of {age} ago): wait for it, or remove {lease_url} "
-                "if it is gone."
+                f"another process is copying to {url} ({owner}, last heard of {age} ago): wait for it, or remove "
+                f"{lease_url} if it is gone."
             )
         log.warning(f"{url}: taken over from {owner}, silent for {age}.")
         remove(lease_url)

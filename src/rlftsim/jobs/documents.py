@@ -8,7 +8,8 @@ import math
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from errno import ESPIPE
 from itertools import chain
 from os import PathLike, fspath, fstat, stat
@@ -101,10 +102,7 @@ def parse_json(
     def parse(decoded: str) -> Any:
         try:
             value = json.loads(
-                decoded,
-                parse_float=None if allow_nan else parse_float,
-                parse_constant=parse_float,
-                parse_int=parse_int,
+                decoded, parse_float=None if allow_nan else parse_float, parse_constant=parse_float, parse_int=parse_int
             )
             # every name has a colon; more of them are in texts, or behind a name that is written twice
             if _count_names(value) < decoded.count(":"):
@@ -122,16 +120,19 @@ def parse_json(
     return value
 
 
-def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError) -> dict[str, Any]:
+def read_toml(
+    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
+) -> dict[str, Any]:
     """Values of a TOML file in UTF-8 by name, with or without a mark in front.
 
     Args:
         path: TOML file of at most `MAX_TOML_BYTES`.
         remedy: Way out at the end of every message.
         error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
-        FileNotFoundError: No such file; the caller names the file in the message.
+        FileNotFoundError: No such file, and no message for that.
         RlftsimError: The file cannot be read, is no TOML, or nests brackets too deeply.
     """
 
@@ -145,7 +146,8 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
         except tomllib.TOMLDecodeError as problem:
             raise ValueError(f"not TOML: {problem}") from None
 
-    return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error), parse, str(path), remedy, error)
+    text = _read_bytes(path, MAX_TOML_BYTES, remedy, error, missing)
+    return _parse(text, parse, str(path), remedy, error)
 
 
 def describe_type(value: object) -> str:
@@ -171,22 +173,51 @@ def check_has_end(path: str | PathLike[str]) -> None:
         raise OSError(ESPIPE, "a pipe, not a file")
 
 
-def _read_bytes(
-    path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError], missing: str = ""
-) -> bytes:
+@contextmanager
+def explained_damage(
+    path: str | PathLike[str],
+    damage: tuple[type[Exception], ...],
+    remedy: str,
+    *,
+    words: str = ": cannot be read",
+    describe: Callable[[BaseException], str] = first_line,
+    error: type[RlftsimError] = DataError,
+    missing: str = "",
+) -> Iterator[None]:
+    """Context in which a library reads a file, no pipe: its errors become one line that names file, cause and way out.
+
+    Args:
+        path: File that is read.
+        damage: Errors of the library that stand for a damaged file.
+        remedy: Way out at the end of the message.
+        words: Words behind the path.
+        describe: Function from an error to the cause in words.
+        error: Class of the errors raised.
+        missing: Whole message where there is no such file; empty leaves it to the caller.
+
+    Raises:
+        FileNotFoundError: No such file, and no message for that.
+        RlftsimError: Damaged file, or a pipe.
+    """
     try:
         check_has_end(path)
+        yield
+    except FileNotFoundError:
+        if missing:
+            raise error(missing) from None
+        raise
+    except damage as problem:
+        raise error(f"{path}{words} ({describe(problem)}): {remedy}.") from None
+
+
+def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError], missing: str) -> bytes:
+    # ValueError: a null byte in the name
+    with explained_damage(path, (OSError, ValueError, ZlibError), remedy, error=error, missing=missing):
         with open(path, "rb") as file:
             # a device or a pipe has no size, so the bytes that come are counted, too
             text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None
         if text and text.startswith(_GZIP):
             text = decompressobj(wbits=31).decompress(text, limit + 1)
-    except FileNotFoundError:
-        if missing:
-            raise error(missing) from None
-        raise
-    except (OSError, ValueError, ZlibError) as problem:  # the second: a null byte in the name
-        raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None
     if text is None or len(text) > limit:
         raise error(f"{path}: larger than {limit >> 20} MiB, which no such file is: {remedy}.")
     return text

@@ -12,8 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
-from safetensors import SafetensorError
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from rlftsim.errors import DataError
@@ -23,8 +22,6 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the operating system where a file does not fit."""
 _TEMPORARY = re.compile(r"\.(.+)\.(\d+)\.tmp")
 """Names that `temporary_path` gives: of file and machine, and the number of the process."""
-_ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
-"""Where safetensors writes the number of an error of the operating system."""
 
 
 @contextmanager
@@ -143,8 +140,7 @@ def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:
     """True for a temporary file of one of the names whose writer has ended, or is on another machine."""
     name = name_and_host.removesuffix(f".{socket.gethostname()}")
     if name == name_and_host:  # of another machine, whose name may have dots as the file's may
-        words = name.split(".")
-        return any(".".join(words[:number]) in names for number in range(1, len(words)))
+        return any(name.startswith(f"{output}.") for output in names)
     is_asked = process != os.getpid() and os.name == "posix"  # elsewhere the question ends the process
     return name in names and not (is_asked and _is_running(process))
 
@@ -215,31 +211,16 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
     Raises:
         DataError: The file cannot be written, see `write_atomically`.
     """
-
-    def write(temporary: Path) -> None:
-        contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-        try:
-            save_file(contiguous, temporary, metadata=metadata)
-            _sort_metadata(temporary)
-        except SafetensorError as error:  # safetensors reports a full disk by an error of its own
-            number = _ERROR_NUMBER.search(str(error))
-            raise (OSError(int(number[1]), os.strerror(int(number[1]))) if number else OSError(str(error))) from None
-        # safetensors writes files that only their owner may read, whatever the umask.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-
-    write_atomically(path, write)
+    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata)
+    content = _sort_metadata(content) if metadata else content
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
-def _sort_metadata(path: Path) -> None:
+def _sort_metadata(content: bytes) -> bytes:
     """Sort the metadata in the header of a safetensors file: the order differs from process to process."""
-    with path.open("r+b") as file:
-        size = int.from_bytes(file.read(8), "little")
-        header = parse_json(file.read(size), "write it again", source=str(path))
-        if "__metadata__" in header:
-            header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-            text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
-            assert len(text) == size, "both write JSON without spaces"
-            file.seek(8)
-            file.write(text)
+    size = int.from_bytes(content[:8], "little")
+    header = parse_json(content[8 : 8 + size], "write it again", source="tensors")
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
+    assert len(text) == size, "both write JSON without spaces"
+    return content[:8] + text + content[8 + size :]

@@ -292,11 +292,8 @@ class Lease:
 
     def _refusal(self, file: TextIO) -> str:
         """Message with the owner and age of a lock."""
-        try:
-            owner, age = parse_owner(_read_lock(file))
-            whom = f" ({owner}, for {age})"
-        except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
-            whom = ""
+        owner, age = parse_owner(_read_lock(file))
+        whom = f" ({owner}, for {age})" if owner else ""
         return f"another process {self._doing} {self._path.parent}{whom}: wait for it or choose another destination."
 
 
@@ -322,11 +319,10 @@ def describe_owner() -> str:
 
 
 def parse_owner(text: str) -> tuple[str, timedelta]:
-    """Process and age of the last line of a text, in the format of `describe_owner`.
-
-    Raises:
-        ValueError, TypeError: There is no such line.
-    """
+    """Process and age of the last line of a text, in the format of `describe_owner`; no name for any other text."""
     owner, _, since = (text.splitlines() or [""])[-1].partition(" since ")
-    age = int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds())
+    try:
+        age = int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds())
+    except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
+        return "", timedelta()
     return owner, timedelta(seconds=max(age, 0))  # its clock may be ahead of ours

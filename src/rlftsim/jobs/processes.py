@@ -303,14 +303,12 @@ def _check_main_guard() -> None:
         return
     # The statement of the script that is being executed: guarded if it is an `if` about __name__.
     line = frame.f_lineno
-    for statement in statements:
-        if statement.lineno <= line <= (statement.end_lineno or statement.lineno):
-            is_guarded = isinstance(statement, ast.If) and "__name__" in ast.unparse(statement.test)
-            if not is_guarded:
-                raise ConfigError(
-                    f'{file}, line {line}, starts other processes: put it under `if __name__ == "__main__":`, '
-                    "as each of them imports the script again, or set jobs=1."
-                )
+    running = [s for s in statements if s.lineno <= line <= (s.end_lineno or s.lineno)]
+    if not all(isinstance(statement, ast.If) and "__name__" in ast.unparse(statement.test) for statement in running):
+        raise ConfigError(
+            f'{file}, line {line}, starts other processes: put it under `if __name__ == "__main__":`, as each of them '
+            "imports the script again, or set jobs=1."
+        )
 
 
 def _work(line: Connection) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.documents import first_line
 from rlftsim.jobs.processes import (
     OUT_OF_MEMORY,
     Advance,
@@ -85,9 +86,8 @@ class RayRunner:
                     socket.create_connection((host, int(port)), timeout=10).close()
                 ray.init(self.address, log_to_driver=False, logging_level=logging.ERROR)
             except (OSError, RuntimeError, ValueError) as error:
-                cause = str(error).strip().splitlines()[0]
                 raise ConfigError(
-                    f"--ray {self.address}: no Ray cluster there ({cause}): `ray start` makes one."
+                    f"--ray {self.address}: no Ray cluster there ({first_line(error)}): `ray start` makes one."
                 ) from None
         try:
             return self._run(pickled, items, advance, describe)
@@ -138,7 +138,7 @@ class RayRunner:
                     try:
                         event, value, total, seconds, machine = pickle.loads(ray.get(ref))
                     except RayError as error:
-                        reason = _reason(error)
+                        reason = f"{type(error).__name__}: {first_line(error)}"
                         if self.on_death == "stop":
                             name = describe(items[number])
                             raise DataError(
@@ -223,11 +223,6 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
         error = portable_error(error)
         error.add_note(f"on {machine}")
         return pickle.dumps(("error", error, total, time.monotonic() - start, machine))
-
-
-def _reason(error: RayError) -> str:
-    """First line of Ray's message about the end of a process."""
-    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
 
 
 def _cancel(refs: list[Any]) -> None:

@@ -14,8 +14,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rlftsim.errors import DataError, RlftsimError
-from rlftsim.jobs.documents import check_has_end, first_line
+from rlftsim.errors import DataError
+from rlftsim.jobs.documents import check_has_end, explained_damage, first_line
 
 MAX_VALUES = 1 << 25
 """Values that a Parquet file may hold, however small it is: 256 MiB of numbers."""
@@ -30,36 +30,25 @@ _ARROW_BEGINNING = b"ARROW1\0\0"
 _DAMAGE = (OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, pa.ArrowException)
 
 
-def read_parquet(
-    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError, missing: str = ""
-) -> pa.Table:
+def read_parquet(path: str | PathLike[str], remedy: str, *, missing: str = "") -> pa.Table:
     """Validated table of a Parquet file.
 
     Args:
         path: Parquet file; a folder is none.
         remedy: Way out at the end of every message, such as "convert again".
-        error: Class of the errors raised.
         missing: Whole message where there is no such file; empty leaves it to the caller.
 
     Raises:
         FileNotFoundError: No such file, and no message for that.
-        RlftsimError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can
-            explain.
+        DataError: Damaged file, text that is no UTF-8, a column twice, or more values than the file's size can explain.
     """
-    try:
-        check_has_end(path)
+    with explained_damage(path, _DAMAGE, remedy, describe=_describe_cause, missing=missing):
         num_bytes = stat(path).st_size
         with _limited_memory(MAX_TABLE_BYTES + MAX_BYTES_PER_BYTE * num_bytes), pq.ParquetFile(path) as file:
             _check_size(file.metadata, num_bytes)
             # in batches: memory for as many values as a damaged column tells would be taken at once; without threads,
             # whose stacks would count as memory
             return _validate_table(pa.Table.from_batches(file.iter_batches(use_threads=False), file.schema_arrow))
-    except FileNotFoundError:
-        if missing:
-            raise error(missing) from None
-        raise
-    except _DAMAGE as problem:
-        raise error(f"{path}: cannot be read ({_describe_cause(problem)}): {remedy}.") from None
 
 
 def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
@@ -75,8 +64,7 @@ def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
         FileNotFoundError: No such file; the caller names the file in the message.
         DataError: Damaged or compressed file, or text that is no UTF-8.
     """
-    try:
-        check_has_end(path)
+    with explained_damage(path, _DAMAGE, remedy, words=" is damaged", describe=_describe_cause):
         file = pa.memory_map(fspath(path))
         reader = pa.ipc.open_file(file)
         file.seek(len(_ARROW_BEGINNING))
@@ -87,10 +75,6 @@ def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
             raise ValueError("it is compressed, as this package writes no shard")
         batches = [pa.ipc.read_record_batch(message, reader.schema) for message in messages]
         return _validate_table(pa.Table.from_batches(batches, reader.schema))
-    except FileNotFoundError:
-        raise
-    except _DAMAGE as problem:
-        raise DataError(f"{path} is damaged ({_describe_cause(problem)}): {remedy}.") from None
 
 
 def read_parquet_metadata(path: str | PathLike[str]) -> Mapping[bytes, bytes]:

@@ -33,7 +33,7 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
     folder, url = Path(folder), folder_address(url)
     check_writable(url)
     manifest = read_manifest(folder)
-    with remote_lease(url, "is copying to") as renew:
+    with remote_lease(url) as renew:
         try:
             published = {(entry.file, entry.sha256) for entry in parse_manifest(mirror(url, (INDEX, MANIFEST))).shards}
         except DataError:  # no data set there yet

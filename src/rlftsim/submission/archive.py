@@ -31,7 +31,7 @@ MAX_EXPANSION, LEAST_UNPACKED = 200, 1 << 28
 """Most bytes that a packed byte stands for, in archives of more than so many bytes: sampled rollouts have 2."""
 _GZIP_HEADER = b"\x1f\x8b\x08\x00" + bytes(4) + b"\x04\xff"  # deflate, no name, no time, fastest, unknown system
 _TAR_RECORD = 10240
-_CRC_POLYNOMIAL = 0xEDB88320
+_ALL_BITS = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -163,32 +163,17 @@ def _check_shard(path: Path, shard: PackedShard) -> None:
 def combine_crc32(first: int, second: int, second_size: int) -> int:
     """CRC-32 of two byte strings one after the other.
 
-    The method of zlib's `crc32_combine`: appending a zero bit to a message is a linear map of the CRC over GF(2), and
-    the powers of two of that map append any number of zeros.
+    A checksum is linear but for the inversion of its bits: zeros of the second string's length move the first one on.
 
     Args:
         first: CRC-32 of the first string.
         second: CRC-32 of the second string.
         second_size: Length of the second string in bytes.
     """
-    zero_bit = [_CRC_POLYNOMIAL, *(1 << n for n in range(31))]  # column n: image of bit n
-    matrix, bits = zero_bit, 8 * second_size
-    while bits:
-        if bits & 1:
-            first = _times(matrix, first)
-        matrix = [_times(matrix, column) for column in matrix]
-        bits >>= 1
-    return first ^ second
-
-
-def _times(matrix: Sequence[int], vector: int) -> int:
-    """Product of a matrix over GF(2), given by columns, and a vector of 32 bits."""
-    product = 0
-    for column in matrix:
-        if vector & 1:
-            product ^= column
-        vector >>= 1
-    return product
+    inverted = first ^ _ALL_BITS
+    for start in range(0, second_size, _CHUNK):
+        inverted = zlib.crc32(bytes(min(_CHUNK, second_size - start)), inverted)
+    return inverted ^ _ALL_BITS ^ second
 
 
 class GzipReader:

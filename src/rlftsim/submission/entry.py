@@ -94,10 +94,7 @@ def read_entry(path: str | PathLike[str], *, account: str | None = None, method:
         ConfigError: A file that is missing, or unknown, missing or placeholder values; the message names the file.
     """
     way_out = "write one as docs/submission.md shows"
-    try:
-        values = read_toml(path, way_out, error=ConfigError)
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file: {way_out}.") from None
+    values = read_toml(path, way_out, error=ConfigError, missing=f"{path}: no such file: {way_out}.")
     values |= {name: value for name, value in (("account", account), ("method", method)) if value is not None}
     names = {field.name for field in fields(Entry)}
     missing = [f.name for f in fields(Entry) if f.name not in values and f.default is MISSING]

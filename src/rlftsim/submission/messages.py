@@ -7,30 +7,27 @@ Shapes: N rollouts (scenes), A agents, T = 80 steps; 91 with sizes at each for g
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from io import BytesIO
 
 import numpy as np
 import torch
 from google.protobuf.message import DecodeError
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int, UInt8
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.rollout_files import AXES
+from rlftsim.evaluation.wire_format import BYTES, read_fields
 from rlftsim.realism import SCENARIO_GEN, SIM_AGENTS, Challenge, SimulatedStates
 
 NUM_SCENES = 32
 SIZES = ("width", "length", "height")
 """Sizes of generated agents, in the order of the message."""
-_ARRAY_BYTES = {challenge: 4 * challenge.num_steps for challenge in (SIM_AGENTS, SCENARIO_GEN)}
-_AXIS_KEYS = b"\x12\x1a\x22\x2a"
-"""Keys of center_x, center_y, center_z and heading: field numbers 2 to 5, wire type 2."""
-_SIZE_KEYS, _TYPE_KEY = b"\x3a\x42\x4a", b"\x50"
-"""Keys of the sizes, field numbers 7 to 9, and of the object type, 10."""
+_POSE_NAMES = ("center_x", "center_y", "center_z", "heading")
 _HEADING_FINER = 8
 """Headings are rounded to this fraction of the positions' step, in radians; at 8 m from the center they are equal."""
-_ID_KEY, _FIRST_KEY, _SECOND_KEY = b"\x30", b"\x0a", b"\x12"
 
 
 def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedStates:
@@ -56,12 +53,11 @@ def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedSta
 def count_bytes(challenge: Challenge) -> int:
     """Bytes of one agent in one scene, with an object id below 128: arrays of floats, and a few bytes around them."""
     num_arrays = len(AXES) + len(SIZES) * challenge.makes_scenes
-    return num_arrays * (3 + _ARRAY_BYTES[challenge]) + 5 + 2 * challenge.makes_scenes
+    return num_arrays * (3 + 4 * challenge.num_steps) + 5 + 2 * challenge.makes_scenes
 
 
 def encode_varint(number: int) -> bytes:
-    """A whole number in protobuf's base 128; a negative number takes ten bytes, as in an int32 field."""
-    number &= (1 << 64) - 1
+    """A whole number of 0 or more in protobuf's base 128."""
     digits = bytearray()
     while number >= 0x80:
         digits.append(number & 0x7F | 0x80)
@@ -89,36 +85,40 @@ def encode_rollouts(
             f"scenario {scenario_id}: object id {wide[0]} does not fit the 32 bits that a submission has for it: give "
             "the objects smaller ids and convert again"
         )
-    arrays = [getattr(states, axis).cpu().numpy() for axis in AXES]  # each [N, A, T]
+    arrays = [getattr(states, axis) for axis in AXES]  # each [N, A, T]
     types = [0] * len(states.object_id)
     if states.size is not None:
         assert object_type is not None
-        length, width, height = states.size.cpu().numpy().transpose(3, 0, 1, 2)
+        length, width, height = states.size.unbind(-1)
         arrays, types = [*arrays, width, length, height], object_type.tolist()
-    as_bytes = [np.ascontiguousarray(a, np.dtype("<f4")).view(np.uint8) for a in arrays]  # each [N, A, 4 T]
-    num_bytes = _ARRAY_BYTES[states.challenge]
-    array_size = encode_varint(num_bytes)
-    # Headers are the same in all scenes, so each is written into a column of all of them at once.
-    columns: list[bytes | np.ndarray] = []
-    for agent, (object_id, agent_type) in enumerate(zip(states.object_id.tolist(), types)):
-        middle = _ID_KEY + encode_varint(object_id)
-        tail = _TYPE_KEY + encode_varint(agent_type) if states.challenge.makes_scenes else b""
-        size = len(arrays) * (1 + len(array_size) + num_bytes) + len(middle) + len(tail)
-        columns.append(_FIRST_KEY + encode_varint(size))
-        for number, (key, values) in enumerate(zip(_AXIS_KEYS + _SIZE_KEYS, as_bytes)):
-            head = middle if number == len(AXES) else b""
-            columns += [head + bytes([key]) + array_size, values[:, agent]]
-        columns.append(tail or middle)
-    scene_size = sum(c.shape[1] if isinstance(c, np.ndarray) else len(c) for c in columns)
-    head = _SECOND_KEY + encode_varint(scene_size)
-    scenes = np.empty((len(arrays[0]), len(head) + scene_size), np.uint8)  # [N, bytes]
-    at = 0
-    for column in (head, *columns):
-        block = column if isinstance(column, np.ndarray) else np.frombuffer(column, np.uint8)
-        scenes[:, at : at + block.shape[-1]] = block
-        at += block.shape[-1]
-    name = scenario_id.encode()
-    return _FIRST_KEY + encode_varint(len(name)) + name + scenes.tobytes() * states.repeat
+    values = torch.stack(arrays, 2).flatten(1, 2).cpu().numpy().astype("<f4", copy=False)  # [N, A arrays, T]
+    layout, starts = _lay_out_scene(states.object_id.tolist(), types, states.challenge)
+    scenes = np.repeat(layout[:1], len(values), 0)  # [N, bytes]
+    for array, start in zip(values.view(np.uint8).swapaxes(0, 1), starts):
+        scenes[:, start : start + array.shape[1]] = array
+    name = submission_pb2.ScenarioRollouts(scenario_id=scenario_id)
+    return name.SerializeToString() + scenes.tobytes() * states.repeat
+
+
+def _lay_out_scene(
+    object_ids: Sequence[int], object_types: Sequence[int], challenge: Challenge
+) -> tuple[UInt8[np.ndarray, "2 bytes"], Int[np.ndarray, "arrays"]]:
+    """Two serialized scenes that differ in all bytes of all numbers and in no other, and where their arrays begin."""
+    layout = []
+    for number in (0.0, 1.1):
+        message = submission_pb2.ScenarioRollouts()
+        agents = message.joint_scenes.add().simulated_trajectories
+        names = (*_POSE_NAMES, *SIZES) if challenge.makes_scenes else _POSE_NAMES
+        arrays = submission_pb2.SimulatedTrajectory(**dict.fromkeys(names, [number] * challenge.num_steps))
+        for object_id, object_type in zip(object_ids, object_types):
+            agent = agents.add()
+            agent.CopyFrom(arrays)
+            agent.object_id = object_id
+            if challenge.makes_scenes:
+                agent.object_type = object_type
+        layout.append(np.frombuffer(message.SerializeToString(), np.uint8))
+    is_number = layout[0] != layout[1]
+    return np.stack(layout), np.flatnonzero(is_number & ~np.roll(is_number, 1))  # a scene begins with a key
 
 
 @dataclass(frozen=True)
@@ -159,79 +159,28 @@ def decode_rollouts(data: bytes) -> DecodedRollouts:
 
 
 def _decode_uniform(data: bytes, challenge: Challenge) -> DecodedRollouts | None:
-    """Contents where all scenes have the layout of the first and fill the message; None for any other message."""
-    array_bytes, num_arrays = _ARRAY_BYTES[challenge], len(AXES) + len(SIZES) * challenge.makes_scenes
+    """Contents where all scenes have the layout that `encode_rollouts` gives to the first; None for any other."""
     try:
-        name, at = _payload(data, 0, _FIRST_KEY)
-        first, stop = _payload(data, at, _SECOND_KEY)
-        stride = stop - at
-        num_scenes, remainder = divmod(len(data) - at, stride)
-        if remainder:
+        fields = read_fields(BytesIO(data), len(data))
+        name, scene = next(fields), next(fields)
+        agents = submission_pb2.JointScene.FromString(scene.payload).simulated_trajectories
+        if len(agents) * count_bytes(challenge) > len(scene.payload):  # too short for their numbers
             return None
-        rows = np.frombuffer(data, np.uint8, offset=at).reshape(num_scenes, stride)
-        # 1. the first scene: ids, and where in a row the arrays begin
-        ids, starts = [], []  # [A], [A][arrays]
-        position = first.start
-        while position < first.stop:
-            agent, position = _payload(data, position, _FIRST_KEY)
-            inside, agent_starts, object_id = agent.start, [], -1
-            for key in (_AXIS_KEYS + _SIZE_KEYS)[:num_arrays]:
-                array, inside = _payload(data, inside, bytes([key]))
-                if len(array) != array_bytes:
-                    return None
-                agent_starts.append(array.start - at)
-                if len(agent_starts) == len(AXES):
-                    object_id, inside = _read_number(data, inside, _ID_KEY)
-            if challenge.makes_scenes:
-                _, inside = _read_number(data, inside, _TYPE_KEY)
-            if inside != agent.stop:
-                return None
-            ids.append((object_id + (1 << 31)) % (1 << 32) - (1 << 31))  # as an int32
-            starts.append(agent_starts)
-    except (IndexError, ValueError):
+        object_ids = tuple(agent.object_id for agent in agents)
+        layout, starts = _lay_out_scene(object_ids, [agent.object_type for agent in agents], challenge)
+        offset = len(name.head) + len(name.payload)
+        rows = np.frombuffer(data, np.uint8, offset=offset).reshape(-1, layout.shape[1])  # [N, bytes]
+    except (DataError, DecodeError, StopIteration, ValueError):
         return None
-    # 2. all other bytes must be equal in all scenes
-    is_number = np.zeros(stride, bool)
-    for start in chain.from_iterable(starts):
-        is_number[start : start + array_bytes] = True
-    headers = rows[:, ~is_number]
-    if not ids or not (headers == headers[0]).all():
+    is_header = layout[0] == layout[1]
+    if not agents or (name.number, name.wire_type) != (1, BYTES) or (rows[:, is_header] != layout[0, is_header]).any():
         return None
-    values = np.empty((num_scenes, len(ids), num_arrays, challenge.num_steps), np.dtype("<f4"))
-    as_bytes = values.view(np.uint8)  # [N, A, arrays, 4 T]
-    for agent, agent_starts in enumerate(starts):
-        for axis, start in enumerate(agent_starts):
-            as_bytes[:, agent, axis] = rows[:, start : start + array_bytes]
-    return DecodedRollouts(as_text(data[name.start : name.stop]), (tuple(ids),) * num_scenes, (), values, challenge)
-
-
-def _payload(data: bytes, position: int, key: bytes) -> tuple[range, int]:
-    """Bytes of a field of wire type 2 at a position, and the position after the field."""
-    if data[position : position + 1] != key:
-        raise ValueError
-    size, start = _varint(data, position + 1)
-    if start + size > len(data):
-        raise ValueError
-    return range(start, start + size), start + size
-
-
-def _read_number(data: bytes, position: int, key: bytes) -> tuple[int, int]:
-    """Value of a field of wire type 0 at a position, and the position after the field."""
-    if data[position : position + 1] != key:
-        raise ValueError
-    return _varint(data, position + 1)
-
-
-def _varint(data: bytes, position: int) -> tuple[int, int]:
-    """The number at a position, and the position after the number."""
-    value = 0
-    for shift in range(0, 70, 7):
-        byte = data[position]
-        value |= (byte & 0x7F) << shift
-        position += 1
-        if byte < 0x80:
-            return value, position
-    raise ValueError  # no number has more than 10 bytes
+    values = np.empty((len(rows), len(starts), challenge.num_steps), np.dtype("<f4"))
+    as_bytes = values.view(np.uint8)  # [N, A arrays, 4 T]
+    for number, start in enumerate(starts):
+        as_bytes[:, number] = rows[:, start : start + as_bytes.shape[2]]
+    values = values.reshape(len(rows), len(agents), -1, challenge.num_steps)
+    return DecodedRollouts(as_text(name.payload), (object_ids,) * len(rows), (), values, challenge)
 
 
 def as_text(value: str | bytes) -> str:
@@ -250,7 +199,7 @@ def _decode_message(data: bytes) -> DecodedRollouts:
     trajectories = [agent for scene in message.joint_scenes for agent in scene.simulated_trajectories]
     is_generated = any(agent.width or len(agent.center_x) == SCENARIO_GEN.num_steps for agent in trajectories)
     challenge = SCENARIO_GEN if is_generated else SIM_AGENTS
-    names = (*(f"center_{axis}" for axis in AXES[:3]), "heading", *(SIZES if is_generated else ()))
+    names = (*_POSE_NAMES, *SIZES) if is_generated else _POSE_NAMES
     scenes, ids, wrong_lengths = [], [], []
     for number, scene in enumerate(message.joint_scenes):
         arrays = {}

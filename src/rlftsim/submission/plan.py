@@ -194,7 +194,7 @@ class Job:
         except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
         sizes, sums = (shard.size, shard.raw_size), (shard.piece_crc, shard.raw_crc)
-        fits = min(*sizes, *sums) >= 0 and max(sizes) < 1 << 50 and max(sums) < 1 << 32
+        fits = min(*sizes, *sums) >= 0 and max(sizes) < 1 << 36 and max(sums) < 1 << 32
         return shard if fits and shard.file == self.shard_path(number).name else None
 
 

@@ -33,7 +33,7 @@ from rlftsim.realism import (
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.check import ArchiveCheck
-from rlftsim.submission.findings import CHECKS, Finding
+from rlftsim.submission.findings import CHECKS
 from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
 BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}
@@ -89,18 +89,9 @@ def estimate_realism(path: str | PathLike[str], policy_fingerprint: str, config:
 class Report:
     """Contents, checks, origin and expected realism of an archive."""
 
-    archive: str
-    bytes: int
-    sha256: str
+    check: ArchiveCheck
     method: str
     num_parameters: str
-    shards: int
-    scenarios: int
-    trajectories: int
-    message_bytes: int
-    findings: tuple[Finding, ...]
-    counts: dict[int, int]
-    """Findings by check."""
     closed_loop: str
     """Statement that the entry makes."""
     card: str
@@ -110,31 +101,33 @@ class Report:
     seconds: float
     estimate: Estimate | str
 
-    def write(self, archive: Path) -> list[Path]:
-        """Write `submission.report.md` and `.json` beside the archive; returns both paths."""
+    def write(self, archive: Path) -> str:
+        """Write `submission.report.md` and `.json` beside the archive; returns the text."""
         json_path, text_path = (report_path(archive, ending) for ending in ("json", "md"))
         remove_temporaries([json_path, text_path])
-        write_text(text_path, self.as_text())
-        write_text(json_path, json.dumps(asdict(self), indent=1) + "\n")
-        return [text_path, json_path]
+        text, values = self.as_text(), vars(self) | summarize(self.check)
+        del values["check"]
+        write_text(text_path, text)
+        write_text(json_path, json.dumps(values, indent=1, default=asdict) + "\n")
+        return text
 
     def as_text(self) -> str:
         """The report in Markdown."""
+        check, counts = self.check, self.check.findings.counts
         checks = [
-            f"| {number} | {title} | {f'**{self.counts[number]} findings**' if self.counts.get(number) else 'passed'} |"
+            f"| {number} | {title} | {f'**{counts[number]} findings**' if counts[number] else 'passed'} |"
             for number, title in CHECKS.items()
         ]
-        findings = [f"* {finding.severity}, check {finding.check}: {finding}" for finding in self.findings]
-        work = [f"* {name}: {value}" for name, value in self.work.items()]
         contents = [
-            f"* {self.bytes} bytes ({self.bytes / 1e9:.3g} GB), SHA-256 `{self.sha256}`",
-            f"* {self.scenarios} scenarios in {self.shards} shards, {self.trajectories} trajectories, "
-            f"{self.message_bytes / 1e9:.3g} GB of messages",
+            f"* {check.size} bytes ({check.size / 1e9:.3g} GB), SHA-256 `{check.sha256}`",
+            f"* {check.num_scenarios} scenarios in {len(check.shards)} shards, {check.num_trajectories} trajectories, "
+            f"{check.raw_bytes / 1e9:.3g} GB of messages",
             f"* {self.num_parameters} parameters; built and checked in {self.seconds:.0f} s",
-            *work,
+            *(f"* {name}: {value}" for name, value in self.work.items()),
         ]
+        findings = [f"* {finding.severity}, check {finding.check}: {finding}" for finding in check.findings.stored]
         sections = {
-            f"# Submission {self.archive}: {self.method}": contents,
+            f"# Submission {check.archive}: {self.method}": contents,
             "## Checks": ["| | check | result |", "|---|---|---|", *checks, "", *findings],
             "## Realism to expect": _estimate_lines(self.estimate),
             "## Closed loop": [self.closed_loop],
@@ -142,6 +135,22 @@ class Report:
             "## After the upload": [SERVER_ERRORS],
         }
         return "\n".join(line for title, lines in sections.items() for line in (title, "", *lines, ""))
+
+
+def summarize(check: ArchiveCheck) -> dict[str, Any]:
+    """Contents and findings of an archive by name, as JSON files have them."""
+    return {
+        "archive": check.archive,
+        "bytes": check.size,
+        "sha256": check.sha256,
+        "shards": len(check.shards),
+        "scenarios": check.num_scenarios,
+        "checked": check.num_checked,
+        "trajectories": check.num_trajectories,
+        "message_bytes": check.raw_bytes,
+        "counts": dict(sorted(check.findings.counts.items())),
+        "findings": [asdict(finding) for finding in check.findings.stored],
+    }
 
 
 def model_card(name: str) -> str:
@@ -167,11 +176,6 @@ def reported_sha256(archive: Path) -> str | None:
         return None
 
 
-def select_findings(check: ArchiveCheck) -> tuple[tuple[Finding, ...], dict[int, int]]:
-    """The findings of a check in the form of a report, and the number of findings of each check."""
-    return tuple(check.findings.stored), dict(sorted(check.findings.counts.items()))
-
-
 def write_findings(check: ArchiveCheck, path: Path) -> None:
     """Write the findings of a check as JSON.
 
@@ -179,18 +183,7 @@ def write_findings(check: ArchiveCheck, path: Path) -> None:
         check: Check of an archive of any writer.
         path: File that is written or replaced.
     """
-    findings, counts = select_findings(check)
-    values = {
-        "archive": check.archive,
-        "bytes": check.size,
-        "sha256": check.sha256,
-        "shards": len(check.shards),
-        "scenarios": check.num_scenarios,
-        "checked": check.num_checked,
-        "counts": counts,
-        "findings": [asdict(finding) for finding in findings],
-    }
-    write_text(path, json.dumps(values, indent=1) + "\n")
+    write_text(path, json.dumps(summarize(check), indent=1) + "\n")
 
 
 def _estimate_lines(estimate: Estimate | str) -> list[str]:
@@ -204,15 +197,11 @@ def _estimate_lines(estimate: Estimate | str) -> list[str]:
     lines = [
         f"RMM {estimate.rmm:.4f}, 95 % interval {low:.4f} to {high:.4f} (sampling of scenarios), over "
         f"{estimate.scenarios} scenarios of `{estimate.evaluation}`; with the traffic light term set to 1 "
-        f"{estimate.rmm_light_one:.4f}. Validation and test split differ.",
+        f"{estimate.rmm_light_one:.4f}. Validation and test split differ."
     ]
     if metric_by_name(estimate.metric).challenge != SIM_AGENTS:
         return lines
-    lines += [
-        "",
-        "| published, test split | RMM | this entry, light = 1, minus it |",
-        "|---|---|---|",
-    ]
+    lines += ["", "| published, test split | RMM | this entry, light = 1, minus it |", "|---|---|---|"]
     for name, value in BOARD.items():
         difference = estimate.rmm_light_one - value
         note = " (within noise)" if abs(difference) <= half else ""
@@ -254,10 +243,7 @@ class ArchiveScores:
             return
         assert decoded.values is not None
         x, y, z, heading, *sizes = torch.from_numpy(decoded.values).unbind(2)
-        size = None
-        if sizes:
-            width, length, height = sizes
-            size = torch.stack([length, width, height], -1)
+        size = torch.stack([sizes[1], sizes[0], sizes[2]], -1) if sizes else None  # length before width
         states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), x, y, z, heading, size=size)
         result = score(scenario, states, self._metric)
         self._rows.append(row_of_result(result, scenario, states))

@@ -45,15 +45,10 @@ def convert(
         machines: Machines that share the work.
     """
     options = {"window": window, "keep_other": keep_other or None, "sizes": sizes}
+    given = {name: value for name, value in options.items() if value is not None}
+    runner = machines.runner(jobs or usable_cores(), on_error)
     report = convert_source(
-        source,
-        destination,
-        reader=reader,
-        split=split,
-        on_error=on_error,
-        jobs=jobs,
-        runner=machines.runner(jobs or usable_cores(), on_error),
-        options={name: value for name, value in options.items() if value is not None},
+        source, destination, reader=reader, split=split, on_error=on_error, jobs=jobs, runner=runner, options=given
     )
     by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
     counts = f"{report.converted} scenarios converted, {count_lost(report.skipped)} lost"

@@ -7,7 +7,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
@@ -27,13 +26,8 @@ GOOD, WARNING, BAD = "good", "warning", "bad"
 MIN_FREE_GB = 2.0
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """Result of one check."""
-
-    subject: str
-    state: str
-    finding: str
+Diagnosis = tuple[str, str, str]
+"""Subject of a check, state, and finding."""
 
 
 def doctor(
@@ -80,8 +74,7 @@ def doctor(
         print_wide(training_table(training, forecast_training(training, measure)))
         return 0
     if plan is not None:
-        model = model or "demo-base"
-        cost = measure_cost(plan, model, data, measure)
+        cost = measure_cost(plan, model or "demo-base", data, measure)
         print_wide(plan_table(plan, cost, num_scenarios=num_scenarios, nodes=nodes, cores=cores, price=price))
         return 0
     for name, value in options.items():
@@ -91,23 +84,19 @@ def doctor(
     diagnoses = [*_versions(), _threads(), _gpu(), _sumo(), _disk(), _pack()]
     table = Table(show_header=False)
     color = {GOOD: "green", WARNING: "yellow", BAD: "red"}
-    for diagnosis in diagnoses:
-        table.add_row(diagnosis.subject, Text(diagnosis.state, style=color[diagnosis.state]), diagnosis.finding)
+    for subject, state, finding in diagnoses:
+        table.add_row(subject, Text(state, style=color[state]), finding)
     print_wide(table)
-    return int(any(diagnosis.state == BAD for diagnosis in diagnoses))
+    return int(any(state == BAD for _, state, _ in diagnoses))
 
 
 def _versions() -> Iterator[Diagnosis]:
     """Python and torch, each with the oldest version that will do."""
-    for software, version_text, oldest in (
-        ("Python", platform.python_version(), (3, 11)),
-        ("torch", torch.__version__, (2, 10)),
-    ):
-        number = tuple(int(digits) for digits in version_text.split("+")[0].split(".")[:2])
-        if number >= oldest:
-            yield Diagnosis(software, GOOD, version_text)
-        else:
-            yield Diagnosis(software, BAD, f"{version_text}: needs {oldest[0]}.{oldest[1]} or newer")
+    checks = (("Python", platform.python_version(), (3, 11)), ("torch", torch.__version__, (2, 10)))
+    for software, text, oldest in checks:
+        is_new = tuple(int(digits) for digits in text.split("+")[0].split(".")[:2]) >= oldest
+        finding = text if is_new else f"{text}: needs {oldest[0]}.{oldest[1]} or newer"
+        yield software, GOOD if is_new else BAD, finding
 
 
 def _threads() -> Diagnosis:
@@ -120,12 +109,10 @@ def _threads() -> Diagnosis:
         seconds.append(_seconds_of_work())
     torch.set_num_threads(num_threads)
     finding = f"{os.cpu_count()} cores, 2 threads take {seconds[1] / seconds[0]:.1f} times as long as 1"
-    if seconds[1] > 1.5 * seconds[0]:
-        policy = os.environ.get("OMP_WAIT_POLICY", "not set")
-        return Diagnosis(
-            "threads", WARNING, f"{finding}: OMP_WAIT_POLICY is {policy}, set it to PASSIVE or use 1 thread"
-        )
-    return Diagnosis("threads", GOOD, finding)
+    if seconds[1] <= 1.5 * seconds[0]:
+        return "threads", GOOD, finding
+    policy = os.environ.get("OMP_WAIT_POLICY", "not set")
+    return "threads", WARNING, f"{finding}: OMP_WAIT_POLICY is {policy}, set it to PASSIVE or use 1 thread"
 
 
 def _seconds_of_work() -> float:
@@ -140,28 +127,26 @@ def _seconds_of_work() -> float:
 
 def _gpu() -> Diagnosis:
     if not torch.cuda.is_available():
-        return Diagnosis("GPU", WARNING, "none: the demo runs on the CPU, training on WOMD wants one")
-    return Diagnosis("GPU", GOOD, torch.cuda.get_device_name())
+        return "GPU", WARNING, "none: the demo runs on the CPU, training on WOMD wants one"
+    return "GPU", GOOD, torch.cuda.get_device_name()
 
 
 def _sumo() -> Diagnosis:
     try:
-        return Diagnosis("SUMO", GOOD, version("eclipse-sumo"))
+        return "SUMO", GOOD, version("eclipse-sumo")
     except PackageNotFoundError:
         hint = 'not installed: only `rlftsim synthesize` needs it (pip install "rlftsim[synthetic]")'
-        return Diagnosis("SUMO", WARNING, hint)
+        return "SUMO", WARNING, hint
 
 
 def _disk() -> Diagnosis:
     free = {str(folder): shutil.disk_usage(folder).free / 1e9 for folder in (Path.cwd(), Path(tempfile.gettempdir()))}
-    state = GOOD if min(free.values()) >= MIN_FREE_GB else WARNING
-    return Diagnosis(
-        "disk", state, ", ".join(f"{gigabytes:.1f} GB free in {folder}" for folder, gigabytes in free.items())
-    )
+    finding = ", ".join(f"{gigabytes:.1f} GB free in {folder}" for folder, gigabytes in free.items())
+    return "disk", GOOD if min(free.values()) >= MIN_FREE_GB else WARNING, finding
 
 
 def _pack() -> Diagnosis:
     damaged = [finding for finding in verify_dataset(pack_path()) if finding.problem.is_damage]
     if damaged:
-        return Diagnosis("synthetic scenarios", BAD, f"{damaged[0]}: install rlftsim again")
-    return Diagnosis("synthetic scenarios", GOOD, "whole")
+        return "synthetic scenarios", BAD, f"{damaged[0]}: install rlftsim again"
+    return "synthetic scenarios", GOOD, "whole"

@@ -20,13 +20,7 @@ from rlftsim.rollout.policy import Sampling, frozen_copy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
-from rlftsim.verbs.inputs import (
-    check_left_out,
-    find_policy_name,
-    to_policy,
-    to_sampling,
-    with_checked_arguments,
-)
+from rlftsim.verbs.inputs import check_left_out, find_policy_name, to_policy, to_sampling, with_checked_arguments
 
 BY_METRIC = ("metric", "goals", "jobs", "guidance_scale", "work")
 """Arguments without effect on rollouts of another length, which are held against the log by windows."""

@@ -29,13 +29,7 @@ from rlftsim.verbs.commands import FINETUNING
 from rlftsim.verbs.inputs import check_config, to_recipe, with_checked_arguments
 from rlftsim.verbs.recipe_flags import RecipeFlags, check_no_settings, find_value
 from rlftsim.verbs.runs import print_model, repeat_for_seeds
-from rlftsim.verbs.training import (
-    find_held_out,
-    load_start,
-    train,
-    with_changes,
-    write_card,
-)
+from rlftsim.verbs.training import find_held_out, load_start, train, with_changes, write_card
 
 __all__ = ["adapt_flags", "check_flags", "finetune", "print_model"]
 

@@ -88,7 +88,7 @@ class MeasuredRun:
     """Of an update, mean over those behind the first."""
     peak_bytes: int
     """Largest memory of a process."""
-    settings: dict[str, object]
+    settings: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -125,30 +125,29 @@ def forecast_training(command: TrainingCommand, num_measured: int) -> TrainingFo
         folder = Path(temporary)
         log.info(f"measure {num_measured} updates")
         run = measure_run(command.write_words(command.data, folder / "run"), folder / "run", WARM_UP + num_measured)
-        batch_size, micro_batch = (int(str(run.settings[name])) for name in ("batch_size", "micro_batch_size"))
-        processes = int(str(run.settings["device.processes"]))
-        counted: Any = {name: value for name, value in run.settings.items() if name in COUNTED}
+        batch_size, processes = run.settings["batch_size"], run.settings["device.processes"]
+        micro_batch = min(run.settings["micro_batch_size"], batch_size)
+        counted = {name: value for name, value in run.settings.items() if name in COUNTED}
         if "lengths" in counted:  # JSON has lists alone
             counted["lengths"] = tuple(counted["lengths"])
         num_updates = method_by_name(command.trainer).settings(**counted).num_updates(len(dataset))
         log.info("measure the largest batch")
-        seed = int(str(run.settings["seed"]))
-        order = np.array(scenarios_of_update(0, min(num_updates * batch_size, MAX_LOOKED_AT), len(dataset), seed))
+        num_seen = min(num_updates * batch_size, MAX_LOOKED_AT)
+        order = np.array(scenarios_of_update(0, num_seen, len(dataset), run.settings["seed"]))
         largest = write_largest(dataset, order, batch_size, processes, folder / "largest")
-        sizes = dict.fromkeys((min(micro_batch, batch_size), processes))
         peaks = {
             size: processes * measure_run(command.write_words(largest, out, (processes, size)), out, 1).peak_bytes
-            for size, out in ((size, folder / f"micro-{size}") for size in sizes)
+            for size, out in ((size, folder / f"micro-{size}") for size in dict.fromkeys((micro_batch, processes)))
         }
-    peak, lowest = peaks[min(micro_batch, batch_size)], peaks[processes]
     fitting = find_fitting_micro_batch(peaks, available, batch_size)
     if not fitting:
         raise DataError(
             f"{command.verb} {command.recipe} cannot fit: at the least micro batch the largest batch needs "
-            f"{lowest / 1e9:.1f} GB of this machine's {available / 1e9:.1f}: take fewer processes, or a smaller model."
+            f"{peaks[processes] / 1e9:.1f} GB of this machine's {available / 1e9:.1f}: take fewer processes, or a "
+            "smaller model."
         )
-    used = min(micro_batch, batch_size)
-    return TrainingForecast(num_updates, run.seconds, num_measured, processes, used, peak, fitting, available)
+    peak, seconds = peaks[micro_batch], run.seconds
+    return TrainingForecast(num_updates, seconds, num_measured, processes, micro_batch, peak, fitting, available)
 
 
 def measure_run(words: list[str], out: Path, num_updates: int) -> MeasuredRun:
@@ -255,15 +254,15 @@ def training_table(command: TrainingCommand, forecast: TrainingForecast) -> Tabl
         caption="without validations and the start; a GPU's own memory is not measured",
         show_header=False, title_justify="left", caption_justify="left",
     )  # fmt: skip
-    needed, available = (value / 1e9 for value in (forecast.peak_bytes, forecast.available_bytes))
-    fits = "" if needed <= available else ", which does not fit"
-    total = forecast.num_updates * forecast.seconds
     table.add_row("updates", str(forecast.num_updates))
-    if math.isnan(total):
+    if math.isnan(forecast.seconds):
         table.add_row("time", f"not measured: it takes {WARM_UP + 1} updates, this run has {forecast.num_updates}")
     else:
+        total = forecast.num_updates * forecast.seconds
         table.add_row("an update", f"{forecast.seconds:.3g} s (mean of {forecast.num_measured})")
         table.add_row("in all", f"{total:.0f} s" if total < 120 else f"{total / 60:.0f} min")
+    needed, available = (value / 1e9 for value in (forecast.peak_bytes, forecast.available_bytes))
+    fits = "" if needed <= available else ", which does not fit"
     table.add_row("peak memory", f"{needed:.1f} GB of {available:.1f} GB, with the largest batch{fits}")
     table.add_row("micro batch", f"{forecast.micro_batch} now, up to {forecast.fitting_micro_batch} fit")
     return table

@@ -72,14 +72,8 @@ def propose_goals(
             _add_rows(table, logged, track, proposals, goal)
             object_id = int(logged.tracks.object_id[track])
             marks = [
-                DrawnGoal(
-                    object_id,
-                    proposal.position,
-                    format_label(proposal),
-                    proposal.path[:, :2],
-                    is_logged=proposal.is_logged,
-                )
-                for proposal in proposals
+                DrawnGoal(object_id, p.position, format_label(p), p.path[:, :2], is_logged=p.is_logged)
+                for p in proposals
             ]
             title = f"{scenario_id}, agent {object_id}"
             panels.append(GoalPanel(title, logged, tuple(marks) or (DrawnGoal(object_id),)))
@@ -160,9 +154,8 @@ def read_given_goals(file: Path | None, written: list[str], scenario_ids: list[s
     goals = GoalsFile(()) if file is None else read_goals(file)
     # A file whose goals would all be ignored is a mistake.
     if file is not None and not goals.goals:
-        advice = "add one"
-        if goals.alternatives:
-            advice = f'move one of its {len(goals.alternatives)} alternatives to "goals"'
+        count = len(goals.alternatives)
+        advice = f'move one of its {count} alternatives to "goals"' if count else "add one"
         raise DataError(f'{file}: has no entry in "goals": {advice}, or leave --goals out.')
     if file is not None and scenario_ids and not any(goals.of_scenario(scenario_id) for scenario_id in scenario_ids):
         raise DataError(
@@ -245,9 +238,8 @@ def _add_rows(
     speed = float(np.linalg.norm(tracks.velocity[track, CURRENT_STEP]))
     agent = (str(tracks.object_id[track]), ObjectType(int(tracks.object_type[track])).name.lower(), f"{speed:.1f}")
     if not proposals:
-        table.add_row(
-            *agent, f"nothing: {no_proposal_reason(scenario, track) or 'no maneuver can be completed in time'}", "", ""
-        )
+        reason = no_proposal_reason(scenario, track) or "no maneuver can be completed in time"
+        table.add_row(*agent, f"nothing: {reason}", "", "")
     for row, proposal in enumerate(proposals):
         entry = to_goal_entry(scenario, proposal)
         mark = " ← goal" if proposal is goal else ""

@@ -85,19 +85,6 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
     return UnitCost(float(np.mean(seconds[1:-1])), len(positions), float(agents.mean()), peak_bytes)
 
 
-def forecast_s(seconds: float, num_scenarios: int, num_items: int, num_cores: int) -> float:
-    """Time until the last core is done, where each takes one piece of the work after another.
-
-    Args:
-        seconds: Processor time of one scenario on one core.
-        num_scenarios: Number of scenarios in all.
-        num_items: Number of pieces of the work; the scenarios are spread evenly over them.
-        num_cores: Cores at work at the same time.
-    """
-    rounds = math.ceil(num_items / num_cores)
-    return seconds * num_scenarios / num_items * rounds
-
-
 def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: int, cores: int, price: float) -> Table:
     """Time and price on one core, one machine and all machines.
 
@@ -122,7 +109,8 @@ def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: 
         title_justify="left", caption_justify="left", min_width=76,  # title and caption wrap at the table's width
     )  # fmt: skip
     for machines, num_cores in dict.fromkeys([(1, 1), (1, cores), (nodes, cores)]):
-        seconds = forecast_s(cost.seconds, total, num_items, machines * num_cores)
+        # until the last core is done, where each takes one piece of the work after another
+        seconds = cost.seconds * total / num_items * math.ceil(num_items / (machines * num_cores))
         dollars = cost.seconds * total / 3600 * price
         table.add_row(f"{machines}", f"{machines * num_cores}", _duration(seconds), f"${dollars:.2f}")
     return table

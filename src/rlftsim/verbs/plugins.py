@@ -1,7 +1,7 @@
 """`rlftsim plugins`: what other packages add."""
 
 import importlib
-from dataclasses import dataclass
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
 
 from rich.table import Table
@@ -25,26 +25,8 @@ POINTS = {
 """Entry-point group -> module and name of its `ExtensionPoint`."""
 
 
-@dataclass(frozen=True)
-class PlugIn:
-    """An entry point of an installed package."""
-
-    group: str
-    """Entry-point group, such as "rlftsim.rewards"."""
-    name: str
-    value: str
-    """Object or module that it names, "package.module:attribute"."""
-    package: str
-    """Name of the distribution that announces it."""
-    version: str
-    """Version of this distribution."""
-    problem: str | None
-    """Reason why it cannot be used; None = it works."""
-
-
-def list_plug_ins() -> list[PlugIn]:
-    """Entry points of installed packages in all groups; their packages are imported, and each is tried out."""
-    plug_ins = []
+def try_plug_ins() -> Iterator[tuple[EntryPoint, str | None]]:
+    """Entry points of installed packages in all groups, and the reason where one cannot be used: each is tried out."""
     for group, location in POINTS.items():
         for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
             module, _, attribute = location.partition(":")
@@ -56,9 +38,7 @@ def list_plug_ins() -> list[PlugIn]:
                     problem = describe_failures(entry)
             except ConfigError as error:
                 problem = str(error)
-            package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
-            plug_ins.append(PlugIn(group, entry.name, entry.value, package, version, problem))
-    return plug_ins
+            yield entry, problem
 
 
 def describe_failures(entry: EntryPoint) -> str | None:
@@ -85,17 +65,16 @@ def plugins() -> int:
     and exporters: policies, planners and recipes are made, rewards are checked on two small scenarios. The exit status
     is 1 if one fails. The others are used all the same.
     """
-    plug_ins = list_plug_ins()
+    plug_ins = list(try_plug_ins())
     if not plug_ins:
         print_line(f"no installed package has an entry point in {', '.join(POINTS)}.")
         return 0
-    headings = ("group", "name", "package", "version", "object", "state")
-    table = Table(*headings)
-    for plug_in in plug_ins:
-        state = "fails" if plug_in.problem else "works"
-        table.add_row(plug_in.group, plug_in.name, plug_in.package, plug_in.version, plug_in.value, state)
+    table = Table("group", "name", "package", "version", "object", "state")
+    for entry, problem in plug_ins:
+        package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
+        table.add_row(entry.group, entry.name, package, version, entry.value, "fails" if problem else "works")
     print_wide(table)
-    problems = [plug_in.problem for plug_in in plug_ins if plug_in.problem]
+    problems = [problem for _, problem in plug_ins if problem]
     for problem in problems:
         print_line(problem)
     return int(bool(problems))

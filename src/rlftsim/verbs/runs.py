@@ -55,8 +55,9 @@ class RunSummary:
     @property
     def last(self) -> float | None:
         """Last value of the measure; of a metric of training batches, which are small, the mean of the last tenth."""
-        values = [value for _, value in self._read_measure()]
-        recent = values[-1:] if self.measure == VALIDATION else values[-math.ceil(len(values) / 10) :]
+        name = self.measure
+        values = [float(line[name]) for line in self.metrics if name is not None and name in line]
+        recent = values[-1:] if name == VALIDATION else values[-math.ceil(len(values) / 10) :]
         return sum(recent) / len(recent) if recent else None
 
     @property
@@ -66,10 +67,6 @@ class RunSummary:
         values = [line for line in self.metrics if self.measure == VALIDATION and VALIDATION in line]
         best = max(values, key=lambda line: line.get(BOUND, line[VALIDATION]), default=None)
         return None if best is None else (int(best["update"]), float(best[VALIDATION]))
-
-    def _read_measure(self) -> list[tuple[int, float]]:
-        name = self.measure
-        return [(int(line["update"]), float(line[name])) for line in self.metrics if name is not None and name in line]
 
 
 def runs(folders: list[str]) -> list[RunSummary]:
@@ -152,24 +149,16 @@ def print_runs(training_runs: list[RunSummary]) -> None:
         table.add_column(heading, justify="left" if heading in ("run", "model", "metric") else "right")
     for name, run in zip(names, training_runs):
         update, best = run.best or (NO_VALUE, None)
-        measure = run.measure or NO_VALUE
-        table.add_row(
-            name,
-            "yes" if run.has_model else "no",
-            str(run.num_updates),
-            measure,
-            _format(run.last),
-            _format(best),
-            str(update),
-        )
+        numbers = (_format(run.last), _format(best), str(update))
+        table.add_row(name, "yes" if run.has_model else "no", str(run.num_updates), run.measure or NO_VALUE, *numbers)
     differences = Table("setting", *names)
     for name, values in find_differences(training_runs).items():
         differences.add_row(name, *values)
     means = Table("mean over seeds, 95 % interval", "seeds", "metric", "last", "best")
     for group in find_seeds(training_runs):
         last, best = [run.last for run in group], [run.best and run.best[1] for run in group]
-        label = _shorten_names([run.folder for run in training_runs])[training_runs.index(group[0])]
-        means.add_row(f"{label} …", str(len(group)), group[0].measure, _average(last), _average(best))
+        label = f"{names[training_runs.index(group[0])]} …"
+        means.add_row(label, str(len(group)), group[0].measure, _average(last), _average(best))
     print_wide(table, *(further for further in (differences, means) if further.row_count))
 
 

@@ -83,11 +83,8 @@ def score(
             scenario with other agents than the simulated one, or a file that cannot be read.
     """
     if isinstance(rollouts, str | os.PathLike) and not isinstance(scenarios, Rollouts):
-        return _score_files(
-            Path(rollouts), scenarios, out, name, explain,
-            ScoreConfig(str(metric), missing_map, missing_scenario, limit, jobs),  # pyright: ignore[reportArgumentType]
-            work,
-        )  # fmt: skip
+        config = ScoreConfig(str(metric), missing_map, missing_scenario, limit, jobs)  # pyright: ignore
+        return _score_files(Path(rollouts), scenarios, out, name, explain, config, work)
     way_out = "leave it out, or name files of rollouts"
     check_left_out(score, locals(), IN_FILES, f"has no effect on rollouts in memory: {way_out}.")
     check_rollouts("score", scenarios, rollouts)

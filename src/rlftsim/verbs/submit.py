@@ -23,7 +23,6 @@ from rlftsim.submission.report import (
     estimate_realism,
     model_card,
     reported_sha256,
-    select_findings,
     write_findings,
 )
 from rlftsim.verbs.arguments import Device
@@ -100,9 +99,7 @@ def build(
         metric=BOARD_METRICS[challenge].name, seed=seed, temperature=temperature, top_k=top_k, split=split,
         rollouts_per_pass=rollouts_per_pass, jobs=jobs,
     )  # fmt: skip
-    job = prepare_job(
-        entry, policy, dataset, settings, out, num_shards=num_shards, round_m=round, is_partial=partial
-    )  # fmt: skip
+    job = prepare_job(entry, policy, dataset, settings, out, num_shards=num_shards, round_m=round, is_partial=partial)
     closed_loop = statement(policy, settings.sampling, settings.challenge)
     print_lines(closed_loop)
     if not i_comply:
@@ -111,15 +108,12 @@ def build(
     # the file that will be uploaded is checked, not what was meant to be in it
     result = check_archive(archive, dataset, challenge=settings.challenge)
     evaluation = evaluation or EVALUATIONS / f"{evaluation_name(model)}.parquet"
-    findings, counts = select_findings(result)
     report = Report(
-        archive.name, result.size, result.sha256, entry.method, count_parameters(policy), len(result.shards),
-        result.num_scenarios, result.num_trajectories, result.raw_bytes, findings, counts, closed_loop,
-        model_card(model), {"model": model, "data set": str(dataset.folder), **job.plan.identity},
-        time.monotonic() - start,
+        result, entry.method, count_parameters(policy), closed_loop, model_card(model),
+        {"model": model, "data set": str(dataset.folder), **job.plan.identity}, time.monotonic() - start,
         estimate_realism(evaluation, str(job.plan.identity["policy"]), settings),
     )  # fmt: skip
-    text, _ = report.write(archive)
+    text = report.write(archive)
     _print_findings(result)
     if result.findings.has_errors:
         print_line(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
@@ -160,13 +154,9 @@ def check(
     dataset = open_dataset(data, split, cache_size=CACHED_SCENARIOS)
     metric = BOARD_METRICS[challenge]
     scores = ArchiveScores(dataset, metric) if score else None
+    checksum = reported_sha256(archive)
     result = check_archive(
-        archive,
-        dataset,
-        sample=sample,
-        expected_sha256=reported_sha256(archive),
-        challenge=metric.challenge,
-        callback=scores,
+        archive, dataset, sample=sample, expected_sha256=checksum, challenge=metric.challenge, callback=scores
     )
     _print_findings(result)
     if json is not None:

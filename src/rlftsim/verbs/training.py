@@ -3,8 +3,7 @@
 import copy
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -82,8 +81,14 @@ def train(
         with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
             train_policy(policy, scenarios, folder, settings, trackers=trackers, **options)
     else:
-        with _learning_curve(Path(out)):
+        try:
             model = train_policy(policy, scenarios, out, settings, trackers=trackers, **options)
+        except BaseException:
+            # The reason why the run ended matters more than a picture that could not be drawn.
+            with suppress(RlftsimError, OSError):
+                _draw_learning_curve(out)
+            raise
+        _draw_learning_curve(out)
         if is_first_process():
             write_calibration_picture(model)
     assert isinstance(policy, nn.Module)
@@ -164,19 +169,6 @@ def find_held_out(
     return held_out
 
 
-@contextmanager
-def _learning_curve(out: Path) -> Iterator[None]:
-    """Draw the learning curve of a run when it ends, for whatever reason."""
-    try:
-        yield
-    except BaseException:
-        # The reason why the run ended matters more than a picture that could not be drawn.
-        with suppress(RlftsimError, OSError):
-            _draw(out)
-        raise
-    _draw(out)
-
-
-def _draw(out: Path) -> None:
+def _draw_learning_curve(out: str | os.PathLike[str]) -> None:
     if is_first_process():
-        write_learning_curve(out)
+        write_learning_curve(Path(out))
