@@ -12,7 +12,7 @@ from rich import box
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, find_direction
+from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, find_direction, format_estimate
 from rlftsim.evaluation.results import LABELS, SCORE_COLUMNS, Evaluation
 from rlftsim.statistics import cluster_bootstrap, mean_interval
 
@@ -293,7 +293,7 @@ def format_table(*evaluations: Evaluation) -> Table:
     table.add_row("scenarios", *counts)
     for column in select_columns(*evaluations):
         means = [evaluation.mean_and_error(column.source) for evaluation in evaluations]
-        table.add_row(column.fraction_label, *(_plus_minus(mean.mean, mean.standard_error) for mean in means))
+        table.add_row(column.fraction_label, *(format_estimate(mean) for mean in means))
     return table
 
 
@@ -342,9 +342,3 @@ def comparison_table(name_a: str, name_b: str, alpha: float) -> Table:
         table.add_column(name, justify="right")
     table.add_column("verdict", no_wrap=True)
     return table
-
-
-def _plus_minus(mean: float, error: float) -> str:
-    if math.isnan(mean):  # no scenario has a value
-        return "–"
-    return f"{mean:.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")

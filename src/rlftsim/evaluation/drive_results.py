@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
-from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
+from rlftsim.evaluation.columns import ARROWS, find_direction, format_estimate
 from rlftsim.evaluation.compare import PairedDifference, compare_paired, comparison_table, pair_rows
 from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
@@ -292,12 +292,7 @@ def format_drives(*results: DriveResult) -> Table:
     for result in results:
         table.add_column(f"{result.name} ({len(result.table)} scenarios)", justify="right")
     for name in MAIN_SCORES:
-        means = [mean_interval(result.values(name)) for result in results]
-        cells = [
-            "–" if not mean.count else f"{format_number(mean.mean, 4)}"
-            + (f" ± {format_number(mean.standard_error, 4)}" if mean.count > 1 else "")
-            for mean in means
-        ]  # fmt: skip
+        cells = (format_estimate(mean_interval(result.values(name))) for result in results)
         table.add_row(f"{name}{ARROWS[find_direction(name)]}", *cells)
     return table
 
