@@ -229,7 +229,7 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
             value_a, value_b = getattr(a.settings, label), getattr(b.settings, label)
             value_b = f"another {value_b}" if value_a == value_b else value_b
             raise DataError(f"{a.name} was driven with {label} {value_a}, {b.name} with {value_b}: drive both alike.")
-    rows_a, rows_b = pair_rows(a, b)
+    rows_a, rows_b = pair_rows(a.name, a.scenario_ids, b.name, b.scenario_ids)
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
     rows = (compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
     return DriveComparison(a, b, tuple(rows))
