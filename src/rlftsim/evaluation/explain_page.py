@@ -26,7 +26,7 @@ from rlftsim.jobs.runner import Advance, Joining, Runner, Share, choose_runner
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
 from rlftsim.viewer.chart import Chart, Curve, chart_html
-from rlftsim.viewer.page import Animation, Panel, animation_html, page_html, table_html, tile_html
+from rlftsim.viewer.page import Animation, Panel, animation_html, page_html, read_asset, table_html, tile_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
 Item = TypeVar("Item")
@@ -38,24 +38,6 @@ _UNITS = {
     "distance_to_nearest_object": "m", "time_to_collision": "s", "distance_to_road_edge": "m",
 }  # fmt: skip
 _BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
-_CSS = """
-.results thead th:has(.narrow) { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }
-.cost { background: color-mix(in srgb, var(--bad) calc(var(--heat) * 45%), transparent); }
-.gain { background: color-mix(in srgb, var(--good) calc(var(--heat) * 45%), transparent); }
-.strip {
-  display: grid; grid-template-columns: minmax(200px, 290px) minmax(0, 1fr) 70px; gap: 4px 14px; align-items: center;
-  font-size: 14px; padding: 14px 18px; font-variant-numeric: tabular-nums;
-}
-.strip svg { width: 100%; height: 20px; display: block; border-radius: 4px; background: var(--page); }
-.strip .amount { text-align: right; }
-.strip .clock { display: flex; justify-content: space-between; color: var(--muted); font-size: 12px; min-width: 0; }
-.swatch { width: 12px; height: 12px; border-radius: 3px; }
-@media (max-width: 640px) {
-  /* Strips go below their labels; amounts fill up the labels' rows. */
-  .strip { grid-template-columns: minmax(0, 1fr) 70px; grid-auto-flow: dense; }
-  .strip svg, .strip .clock { grid-column: 1 / -1; }
-}
-"""
 
 
 def explain_rollouts(
@@ -222,7 +204,7 @@ def explanation_html(explanation: Explanation, policy: str = "") -> str:
         "<h2>What happened</h2>",
         animation_html(Animation(f"Scenario {name}", build_scene(explanation.scenario), panels)),
     ]
-    return page_html(heading, "\n".join(sections), extra_css=_CSS)
+    return page_html(heading, "\n".join(sections), extra_css=read_asset("explain.css"))
 
 
 def _features_html(explanation: Explanation) -> str:
