@@ -16,7 +16,7 @@ from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.goal_attainment import attain_goals
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.experiments.paper.controllability import compute_scenario_rates, estimate_mean
-from rlftsim.experiments.paper.maneuver_goals import propose_goals
+from rlftsim.experiments.paper.maneuver_controllability import propose_goals
 from rlftsim.policies.registry import load_policy, with_guidance
 from rlftsim.scenario.dataset import ScenarioDataset
 

@@ -469,8 +469,8 @@ def make_failures(folder: Path) -> None:
 
 def measure(folder: Path) -> None:
     data = folder / "set"
-    measure_variances(entries.Wanderer(), data, folder / "variances", EVALUATE, show_progress=False)
-    attain_goals(rs.ConstantVelocity(), data, folder / "goals", EVALUATE, _entries(), show_progress=False)
+    measure_variances(entries.Wanderer(), data, folder / "variances", EVALUATE)
+    attain_goals(rs.ConstantVelocity(), data, folder / "goals", EVALUATE, _entries())
 
 
 def make_measured(folder: Path) -> None:

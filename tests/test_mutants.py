@@ -40,7 +40,7 @@ NO_FORMAT = {
     "envs.sumo_traffic": "bytes of this program's own processes",
     "evaluation.explain_page": "whether a page that it moves has an end",
     "evaluation.report": "a picture of this program, which it does not look at",
-    "experiments.paper.published": "the paper's tables in the box",
+    "experiments.tables": "the paper's tables in the box",
     "jobs.buckets": "copies bytes that it does not look at",
     "studio.server": "the page in the box",
     "training.parallel": "bytes of this program's own processes",

@@ -15,7 +15,7 @@ from rlftsim.evaluation import evaluate as module
 from rlftsim.evaluation import rollout_states
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
-from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation, run_groups
+from rlftsim.evaluation.resumable import ScenarioRows, make_evaluation
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -338,8 +338,7 @@ def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, t
         return {"scenario_id": scenario_id, **row} if position % 3 else module.Skipped(scenario_id, "a third is")
 
     ids = [f"s{position}" for position in range(10)]
-    with claim_evaluation("made", provenance, tmp_path, ids, Inline()) as (rows, claim):
-        claim.result = rows.join(run_groups("made", ids, work, rows, claim.lease, Inline(), show_progress=False))
+    make_evaluation("make", "made", provenance, tmp_path, ids, work, runner=Inline(), jobs=1, show_progress=False)
     result = ScenarioRows("made", provenance, tmp_path).read_finished(ids)
     assert (done, result.scenario_ids) == (list(range(10)), ["s1", "s2", "s4", "s5", "s7", "s8"])
     assert [skipped.scenario_id for skipped in result.skipped] == ["s0", "s3", "s6", "s9"]

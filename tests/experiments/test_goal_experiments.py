@@ -18,7 +18,6 @@ from rlftsim.experiments.paper import (
     goal_conditioning,
     kinematic_controllability,
     maneuver_controllability,
-    maneuver_goals,
 )
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
@@ -230,9 +229,9 @@ def test_conditions_are_means_over_scenarios(suite):
 def test_the_goals_are_written_for_a_person_to_edit(suite, monkeypatch):
     given = []
     monkeypatch.setattr(controllability, "measure_attainment", lambda *_, name: given.append(_[-1]) or {})
-    monkeypatch.setattr(maneuver_goals, "propose", made_up_proposals)
+    monkeypatch.setattr(maneuver_controllability, "propose", made_up_proposals)
     maneuver_controllability.run(suite)
-    path = maneuver_goals.goals_path(suite)
+    path = maneuver_controllability.goals_path(suite)
     file = read_goals(path)
     assert [goal.label for goal in file.goals] == ["straight (logged)"]  # only where there is a choice
     assert [goal.label for goal in file.alternatives] == ["left"]
@@ -254,7 +253,7 @@ def test_the_goals_are_written_for_a_person_to_edit(suite, monkeypatch):
     ],
 )  # fmt: skip
 def test_an_edited_goal_is_refused_before_anything_is_trained(goals, message, suite):
-    path = maneuver_goals.goals_path(suite)
+    path = maneuver_controllability.goals_path(suite)
     entries = [GoalEntry(scenario_id, agent, 1040.0, -200.0, label) for scenario_id, agent, label in goals]
     write_goals(path, GoalsFile(tuple(entries[:1]), tuple(entries[1:])))
     with pytest.raises(DataError, match=message):

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlftsim.errors import DataError
-from rlftsim.evaluation.wire_format import read_fields
+from rlftsim.evaluation.wire_format import iterate_fields
 from rlftsim.submission.archive import GzipReader, combine_crc32, count_joined, join_shards, pack_shard
 
 
@@ -102,4 +102,4 @@ def test_an_archive_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
 def test_a_field_larger_than_the_rollouts_of_any_scenario_is_refused_unread(tmp_path, monkeypatch):
     monkeypatch.setattr("rlftsim.evaluation.wire_format.MAX_FIELD_BYTES", 100)
     with pytest.raises(DataError, match="more than any scenario's"):
-        list(read_fields(io.BytesIO(b"\x0a\xc8\x01" + bytes(200)), 203))
+        list(iterate_fields(io.BytesIO(b"\x0a\xc8\x01" + bytes(200)), 0, 203, is_stream=True))

@@ -18,10 +18,11 @@ from rlftsim.evaluation.resumable import (
     ScenarioValues,
     check_same_work,
     check_scenarios_stay,
-    claim_result,
+    make_result,
     read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
+from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import group_positions, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
@@ -131,17 +132,17 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     identity = {"settings": settings.what_counts()}
     files = _SideBySide(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
     runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
-    with claim_result(path, files, ids, find, runner) as claim:
-        if claim.lease is not None:
-            groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
-            title = f"{config.planner} in {settings.traffic}"
-            task = partial(_drive_group, config, settings.traffic, files)
-            stored = run_items(title, groups, task, format=files, lease=claim.lease, runner=runner)
-            rows = [row for group in stored for row in group]
-            missing = {row["scenario_id"]: reasons for row, reasons in rows}
-            claim.result = DriveResult.of(settings, [row for row, _ in rows], missing)
-    assert claim.result is not None
-    return claim.result
+
+    def make(lease: Lease) -> DriveResult:
+        groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
+        title = f"{config.planner} in {settings.traffic}"
+        task = partial(_drive_group, config, settings.traffic, files)
+        stored = run_items(title, groups, task, format=files, lease=lease, runner=runner)
+        rows = [row for group in stored for row in group]
+        missing = {row["scenario_id"]: reasons for row, reasons in rows}
+        return DriveResult.of(settings, [row for row, _ in rows], missing)
+
+    return make_result(path, files, ids, find, runner, make)
 
 
 Row = tuple[dict[str, Any], dict[str, str]]

@@ -15,10 +15,10 @@ from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimat
 from rlftsim.envs.failures import Failure, Repeat
 from rlftsim.envs.planners.registry import PlannerFailure
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.resumable import ScenarioValues, run_groups
+from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
-from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
+from rlftsim.jobs.folder import check_folder, find_differences, write_identity
 from rlftsim.jobs.processes import Task
 from rlftsim.jobs.runner import Joining, Runner, Share
 
@@ -67,7 +67,9 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     # 1. the pilot
     pilot_files = ScenarioValues(out / "pilot", ids, dict.fromkeys(ids, agreed), _read_pilot)
     drive_pilot = partial(_drive_pilot, config, ids)
-    all_pilots: list[Pilot] = _measure(f"pilot of {config.planner}", pilot_files, drive_pilot, runner(len(ids)))
+    all_pilots: list[Pilot] = measure_scenarios(
+        f"pilot of {config.planner}", drive_pilot, pilot_files, runner=runner(len(ids))
+    )
     pilots = [pilot for pilot in all_pilots if not pilot.problem]
     if not pilots:
         raise DataError(all_pilots[0].problem)
@@ -80,7 +82,9 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     names = [item.name for item in items]
     files = ScenarioValues(out / "repeats", names, dict.fromkeys(names, agreed), _read_round)
     drive, telling = partial(_drive_round, config, items), _show_estimate(runner(len(items)), out / "repeats")
-    rounds: list[tuple[Repeat, ...] | str] = _measure(f"failures of {config.planner}", files, drive, telling)
+    rounds: list[tuple[Repeat, ...] | str] = measure_scenarios(
+        f"failures of {config.planner}", drive, files, runner=telling
+    )
     repeats: dict[str, list[Repeat]] = {pilot.scenario_id: [] for pilot in pilots}
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
     for item, finished in zip(items, rounds):
@@ -96,17 +100,6 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     study.write(out / FAILURES)
     remove_temporaries([out / ABOUT, out / FAILURES])  # of processes that were killed
     return study
-
-
-def _measure(
-    title: str, format: ScenarioValues[Any], work: Callable[[int], Mapping[str, object]], runner: Runner
-) -> list[Any]:
-    """Values of all items, from their files, which stay."""
-    with Lease(format.folder / ".lock", runner, "works in") as lease:
-        values = run_groups(title, format.scenario_ids, work, format, lease, runner)
-        remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
-        lease.remove()
-    return values
 
 
 def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict[str, object]:

@@ -16,10 +16,10 @@ import rlftsim
 from rlftsim.envs.planners.registry import hash_code
 from rlftsim.envs.true_world_episode import PLANNERS, Surroundings, Trip, load_model, read_row
 from rlftsim.errors import ConfigError, whole_number
-from rlftsim.evaluation.resumable import ScenarioValues, run_groups
+from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.files import write_atomically
-from rlftsim.jobs.folder import Lease, check_folder
+from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.runner import Runner
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
@@ -111,9 +111,7 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     }  # fmt: skip
     names = [trip.name for trip in trips]
     format = ScenarioValues(out / "episodes", names, identity, read_row)
-    with Lease(format.folder / ".lock", runner, "works in") as lease:
-        rows = run_groups("episodes", names, partial(_drive_trip, trips), format, lease, runner)
-        lease.remove()
+    rows = measure_scenarios("episodes", partial(_drive_trip, trips), format, runner=runner)
     table = pa.Table.from_pylist(rows)
     write_atomically(out / ROWS, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
     return table

@@ -1,6 +1,7 @@
 """Columns of tables of evaluations, the same on the command line, in reports and in experiments."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -59,10 +60,7 @@ class Column:
 
     def cell(self, estimate: MeanInterval | None) -> str:
         """Mean ± standard error; a dash without a finite mean."""
-        if estimate is None or not math.isfinite(estimate.mean):
-            return "–"
-        error = f" ± {self.text(estimate.standard_error)}" if math.isfinite(estimate.standard_error) else ""
-        return f"{self.text(estimate.mean)}{error}"
+        return "–" if estimate is None else format_estimate(estimate, self.text)
 
 
 SCORES = (
@@ -132,7 +130,7 @@ DRIFT_COLUMNS = (
 """Shown in a table of their own in reports: see `evaluation.drift`."""
 
 
-def format_number(value: float, digits: int) -> str:
+def format_number(value: float, digits: int = 4) -> str:
     """A number with fixed digits and a real minus sign.
 
     Args:
@@ -140,3 +138,16 @@ def format_number(value: float, digits: int) -> str:
         digits: Number of digits after the decimal point.
     """
     return f"{value:.{digits}f}".replace("-", "−")
+
+
+def format_estimate(estimate: MeanInterval, format_value: Callable[[float], str] = format_number) -> str:
+    """Mean ± standard error, where there is one; a dash without a finite mean.
+
+    Args:
+        estimate: Mean with its standard error.
+        format_value: Function from a number to its text.
+    """
+    if not math.isfinite(estimate.mean):
+        return "–"
+    error = f" ± {format_value(estimate.standard_error)}" if math.isfinite(estimate.standard_error) else ""
+    return f"{format_value(estimate.mean)}{error}"

@@ -2,9 +2,9 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -12,7 +12,7 @@ from rich import box
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, find_direction
+from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, find_direction, format_estimate
 from rlftsim.evaluation.results import LABELS, SCORE_COLUMNS, Evaluation
 from rlftsim.statistics import cluster_bootstrap, mean_interval
 
@@ -169,7 +169,7 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
                 f"{a.name} and {b.name} cannot be compared, {setting} is {values[0]} and {values[1]}: evaluate both "
                 "alike."
             )
-    rows_a, rows_b = pair_rows(a, b)
+    rows_a, rows_b = pair_rows(a.name, a.scenario_ids, b.name, b.scenario_ids)
     clusters = a.clusters[rows_a]
     num_clusters = len(set(clusters)) if len(set(clusters)) < len(rows_a) else 0
     compare_values = partial(compare_paired, alpha=alpha, clusters=clusters if num_clusters else None)
@@ -180,43 +180,27 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     )
 
 
-@runtime_checkable
-class ScenarioResults(Protocol):
-    """Results with a row per scenario, such as an `Evaluation`."""
-
-    @property
-    def name(self) -> str:
-        """Name in messages."""
-        ...
-
-    @property
-    def scenario_ids(self) -> list[str]:
-        """Scenario of each row."""
-        ...
-
-
-def pair_rows(a: ScenarioResults, b: ScenarioResults) -> tuple[list[int], list[int]]:
-    """Rows of the scenarios that both have, in the order of the first.
+def pair_rows(name_a: str, ids_a: Sequence[str], name_b: str, ids_b: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Rows of the scenarios that two results have, in the order of the first.
 
     Args:
-        a: Results that give the order of the pairs.
-        b: Results that are paired with `a`.
+        name_a: Name in messages of the results that give the order of the pairs.
+        ids_a: Scenario of each of their rows.
+        name_b: Name of the results that are paired with these.
+        ids_b: Scenario of each of their rows.
 
     Raises:
         DataError: No scenario in common, or results with several rows of a scenario.
     """
     # scored files may hold several sets of rollouts of a scenario: nothing says which of them make a pair
-    for results in (a, b):
-        repeated = [scenario_id for scenario_id, count in Counter(results.scenario_ids).items() if count > 1]
+    for name, ids in ((name_a, ids_a), (name_b, ids_b)):
+        repeated = [scenario_id for scenario_id, count in Counter(ids).items() if count > 1]
         if repeated:
-            raise DataError(
-                f"{results.name}: scenario {repeated[0]} has several rows, a pair needs one: score its sets apart."
-            )
-    ids_a, ids_b = a.scenario_ids, b.scenario_ids
+            raise DataError(f"{name}: scenario {repeated[0]} has several rows, a pair needs one: score its sets apart.")
     rows_by_id = {scenario_id: row for row, scenario_id in enumerate(ids_b)}
     rows_a = [row for row, scenario_id in enumerate(ids_a) if scenario_id in rows_by_id]
     if not rows_a:
-        raise DataError(f"{a.name} ({len(ids_a)} scenarios) and {b.name} ({len(ids_b)}) have no scenario in common.")
+        raise DataError(f"{name_a} ({len(ids_a)} scenarios) and {name_b} ({len(ids_b)}) have no scenario in common.")
     return rows_a, [rows_by_id[ids_a[row]] for row in rows_a]
 
 
@@ -232,8 +216,8 @@ def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str],
         DataError: No scenario in common.
         ConfigError: A column that no evaluation has.
     """
-    rows_a, rows_b = pair_rows(a, b)
     ids = a.scenario_ids
+    rows_a, rows_b = pair_rows(a.name, ids, b.name, b.scenario_ids)
     return [ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
 
 
@@ -293,7 +277,7 @@ def format_table(*evaluations: Evaluation) -> Table:
     table.add_row("scenarios", *counts)
     for column in select_columns(*evaluations):
         means = [evaluation.mean_and_error(column.source) for evaluation in evaluations]
-        table.add_row(column.fraction_label, *(_plus_minus(mean.mean, mean.standard_error) for mean in means))
+        table.add_row(column.fraction_label, *(format_estimate(mean) for mean in means))
     return table
 
 
@@ -342,9 +326,3 @@ def comparison_table(name_a: str, name_b: str, alpha: float) -> Table:
         table.add_column(name, justify="right")
     table.add_column("verdict", no_wrap=True)
     return table
-
-
-def _plus_minus(mean: float, error: float) -> str:
-    if math.isnan(mean):  # no scenario has a value
-        return "–"
-    return f"{mean:.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")

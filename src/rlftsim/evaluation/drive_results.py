@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError, check_types
-from rlftsim.evaluation.columns import ARROWS, find_direction, format_number
+from rlftsim.evaluation.columns import ARROWS, find_direction, format_estimate
 from rlftsim.evaluation.compare import PairedDifference, compare_paired, comparison_table, pair_rows
 from rlftsim.evaluation.results import LARGEST
 from rlftsim.jobs.documents import parse_json
@@ -229,7 +229,7 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> Dr
             value_a, value_b = getattr(a.settings, label), getattr(b.settings, label)
             value_b = f"another {value_b}" if value_a == value_b else value_b
             raise DataError(f"{a.name} was driven with {label} {value_a}, {b.name} with {value_b}: drive both alike.")
-    rows_a, rows_b = pair_rows(a, b)
+    rows_a, rows_b = pair_rows(a.name, a.scenario_ids, b.name, b.scenario_ids)
     columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
     rows = (compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
     return DriveComparison(a, b, tuple(rows))
@@ -292,12 +292,7 @@ def format_drives(*results: DriveResult) -> Table:
     for result in results:
         table.add_column(f"{result.name} ({len(result.table)} scenarios)", justify="right")
     for name in MAIN_SCORES:
-        means = [mean_interval(result.values(name)) for result in results]
-        cells = [
-            "–" if not mean.count else f"{format_number(mean.mean, 4)}"
-            + (f" ± {format_number(mean.standard_error, 4)}" if mean.count > 1 else "")
-            for mean in means
-        ]  # fmt: skip
+        cells = (format_estimate(mean_interval(result.values(name))) for result in results)
         table.add_row(f"{name}{ARROWS[find_direction(name)]}", *cells)
     return table
 

@@ -3,7 +3,6 @@
 An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -11,12 +10,11 @@ from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation
+from rlftsim.evaluation.resumable import make_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_states import Oracle, simulate_evaluated
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
-from rlftsim.jobs.items import group_positions, run_items
-from rlftsim.jobs.runner import Advance, Runner, check_jobs, choose_runner
+from rlftsim.jobs.runner import Runner, check_jobs
 from rlftsim.realism import metric_by_name, scenario_log, score
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
@@ -79,19 +77,10 @@ def evaluate(
         sources=dataset.sources,
         guessed=dataset.guessed,
     )
-    groups = group_positions(len(ids), ScenarioRows.items_per_file)
-    runner = runner or choose_runner(config.jobs, len(groups))
-    with claim_evaluation(name, provenance, out, ids, runner) as (rows, claim):
-        if claim.lease is not None:
-            task = partial(_evaluate_group, frozen, dataset, config, rows)
-            claim.result = rows.join(
-                run_items(
-                    f"evaluate {name}", groups, task,
-                    format=rows, lease=claim.lease, runner=runner, show_progress=show_progress,
-                )
-            )  # fmt: skip
-    assert claim.result is not None
-    return claim.result
+    work = partial(_evaluate_scenario, frozen, dataset, config)
+    return make_evaluation(
+        "evaluate", name, provenance, out, ids, work, runner=runner, jobs=config.jobs, show_progress=show_progress
+    )
 
 
 def evaluation_name(model: str | PathLike[str]) -> str:
@@ -116,40 +105,27 @@ def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: Evalu
     }
 
 
-def _evaluate_group(
-    policy: Policy | Oracle,
-    dataset: ScenarioDataset,
-    config: EvaluateConfig,
-    rows: ScenarioRows,
-    group: range,
-    advance: Advance,
-    is_stopped: Callable[[], bool],
-) -> None:
-    """Score the scenarios of a group and write the rows, unless the work is being stopped."""
-    results, device = [], get_device(policy)
-    for position in group:
-        if is_stopped():
-            return
-        scenario = dataset[position]
-        try:
-            scenario.check_consistency()
-            scenario.check_finite_arrays()
-        except DataError as error:
-            # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
-            raise DataError(
-                f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
-                "such scenarios out."
-            ) from None
-        # Without a road edge, for instance, the official metric is undefined.
-        try:
-            log = scenario_log(scenario, device, challenge=config.challenge)
-        except DataError as error:
-            results.append(Skipped(scenario.scenario_id, str(error)))
-        else:
-            states = simulate_evaluated(policy, collate([scenario]), config)
-            if position == 0 and not isinstance(policy, str):  # a wrong unit or frame shows in any scenario
-                warn_of_doubts(scenario, states, f"rollouts of {type(policy).__name__}")
-            result = score(log, states, metric_by_name(config.metric))
-            results.append(row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id)))
-        advance(1)
-    rows.write(group, results)
+def _evaluate_scenario(
+    policy: Policy | Oracle, dataset: ScenarioDataset, config: EvaluateConfig, position: int
+) -> dict[str, object] | Skipped:
+    """Row of a scenario, or the reason for a missing row."""
+    scenario = dataset[position]
+    try:
+        scenario.check_consistency()
+        scenario.check_finite_arrays()
+    except DataError as error:
+        # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
+        raise DataError(
+            f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
+            "such scenarios out."
+        ) from None
+    # Without a road edge, for instance, the official metric is undefined.
+    try:
+        log = scenario_log(scenario, get_device(policy), challenge=config.challenge)
+    except DataError as error:
+        return Skipped(scenario.scenario_id, str(error))
+    states = simulate_evaluated(policy, collate([scenario]), config)
+    if position == 0 and not isinstance(policy, str):  # a wrong unit or frame shows in any scenario
+        warn_of_doubts(scenario, states, f"rollouts of {type(policy).__name__}")
+    result = score(log, states, metric_by_name(config.metric))
+    return row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id))

@@ -39,8 +39,8 @@ from rlftsim.realism.likelihood import (
     stack_scored_steps,
 )
 from rlftsim.realism.meta_metric import form_sets
-from rlftsim.scenario.types import HISTORY_STEPS, ObjectType, Scenario
-from rlftsim.viewer.scene import SceneMotion, logged_trajectories
+from rlftsim.scenario.types import ObjectType, Scenario
+from rlftsim.viewer.scene import SceneMotion, continue_log
 
 WHOLE_FUTURE = -1
 """Last column of the step axis of costs: an agent's whole future, to which collision, off-road and light belong."""
@@ -166,18 +166,6 @@ def to_scene_motion(scenario: Scenario, states: SimulatedStates) -> SceneMotion:
     ids = scenario.tracks.object_id[scenario.simulated_indices].astype(np.int64)
     order = torch.from_numpy(match_agents(ids, states.object_id, scenario.scenario_id))
     # float64: world coordinates may be large, the map frame is near the origin
-    future = torch.stack([states.x, states.y], -1)[:, order].double()  # [N, A, T, 2]
-    future -= torch.from_numpy(scenario.origin)
-    log = logged_trajectories(scenario)
-
-    def after_history(logged: np.ndarray, simulated: Tensor) -> np.ndarray:
-        """[1, A, 91, ...] and [N, A, 80, ...] become [N, A, 91, ...]."""
-        repeated = np.repeat(logged[:, :, :HISTORY_STEPS], len(simulated), axis=0)
-        return np.concatenate([repeated, simulated.float().numpy()], axis=2)
-
-    valid = np.repeat(log.valid[:, :, :HISTORY_STEPS], len(future), axis=0)
-    return SceneMotion(
-        position=after_history(log.position, future),
-        heading=after_history(log.heading, states.heading[:, order]),
-        valid=np.concatenate([valid, states.presence[:, order].cpu().numpy()], axis=2),
-    )
+    future = torch.stack([states.x, states.y], -1)[:, order].double() - torch.from_numpy(scenario.origin)
+    heading, presence = states.heading[:, order].float().numpy(), states.presence[:, order].cpu().numpy()
+    return continue_log(scenario, future.float().numpy(), heading, presence)

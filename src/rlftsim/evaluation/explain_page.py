@@ -26,7 +26,7 @@ from rlftsim.jobs.runner import Advance, Joining, Runner, Share, choose_runner
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
 from rlftsim.viewer.chart import Chart, Curve, chart_html
-from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
+from rlftsim.viewer.page import Animation, Panel, animation_html, page_html, read_asset, table_html, tile_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
 Item = TypeVar("Item")
@@ -38,24 +38,6 @@ _UNITS = {
     "distance_to_nearest_object": "m", "time_to_collision": "s", "distance_to_road_edge": "m",
 }  # fmt: skip
 _BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
-_CSS = """
-.results thead th.narrow { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }
-.cost { background: color-mix(in srgb, var(--bad) calc(var(--heat) * 45%), transparent); }
-.gain { background: color-mix(in srgb, var(--good) calc(var(--heat) * 45%), transparent); }
-.strip {
-  display: grid; grid-template-columns: minmax(200px, 290px) minmax(0, 1fr) 70px; gap: 4px 14px; align-items: center;
-  font-size: 14px; padding: 14px 18px; font-variant-numeric: tabular-nums;
-}
-.strip svg { width: 100%; height: 20px; display: block; border-radius: 4px; background: var(--page); }
-.strip .amount { text-align: right; }
-.strip .clock { display: flex; justify-content: space-between; color: var(--muted); font-size: 12px; min-width: 0; }
-.swatch { width: 12px; height: 12px; border-radius: 3px; }
-@media (max-width: 640px) {
-  /* Strips go below their labels; amounts fill up the labels' rows. */
-  .strip { grid-template-columns: minmax(0, 1fr) 70px; grid-auto-flow: dense; }
-  .strip svg, .strip .clock { grid-column: 1 / -1; }
-}
-"""
 
 
 def explain_rollouts(
@@ -190,9 +172,11 @@ def explanation_html(explanation: Explanation, policy: str = "") -> str:
         "up to it."
     )
     tiles = "".join(
-        f'<div class="card tile"><div class="what">{_words(score)} ({metric})</div>'
-        f'<div class="value">{float(getattr(result, score)):.4f}</div>'
-        f'<div class="interval">ceiling {float(getattr(explanation.ceiling, score)):.4f}</div></div>'
+        tile_html(
+            f"{_words(score)} ({explanation.config.name})",
+            f"{float(getattr(result, score)):.4f}",
+            f"ceiling {float(getattr(explanation.ceiling, score)):.4f}",
+        )
         for score in ("meta_metric", "kinematic", "interactive", "map_based")
     )
     # few: the page holds every drawn trajectory
@@ -220,7 +204,7 @@ def explanation_html(explanation: Explanation, policy: str = "") -> str:
         "<h2>What happened</h2>",
         animation_html(Animation(f"Scenario {name}", build_scene(explanation.scenario), panels)),
     ]
-    return page_html(heading, "\n".join(sections), extra_css=_CSS)
+    return page_html(heading, "\n".join(sections), extra_css=read_asset("explain.css"))
 
 
 def _features_html(explanation: Explanation) -> str:
@@ -234,8 +218,7 @@ def _features_html(explanation: Explanation) -> str:
             f"<tr><th>{_words(name)}</th><td>{explanation.config.weights[index]:.2f}</td><td>{values[0]:.4f}</td>"
             f"<td>{values[1]:.4f}</td>{_heat_cell(lost[index], lost)}</tr>"
         )
-    head = "<tr><th>feature</th><th>weight</th><th>likelihood ↑</th><th>of the log</th><th>cost ↓</th></tr>"
-    return _table_html(head, rows)
+    return table_html(("feature", "weight", "likelihood ↑", "of the log", "cost ↓"), rows)
 
 
 def _agents_html(explanation: Explanation) -> str:
@@ -243,7 +226,7 @@ def _agents_html(explanation: Explanation) -> str:
     by_agent = explanation.cost.sum(2)  # [F, E]
     # features that this year's metric does not count have no column
     columns = [i for i in range(len(FEATURE_NAMES)) if explanation.config.weights[i] > 0]
-    head = "".join(f'<th class="narrow">{_words(FEATURE_NAMES[i])}</th>' for i in columns)
+    headings = [f'<span class="narrow">{_words(FEATURE_NAMES[i])}</span>' for i in columns]
     totals = np.nansum(by_agent, axis=0)  # [E]; NaN: a feature without a scored step
     rows = []
     for agent in np.argsort(-totals, kind="stable"):
@@ -251,7 +234,7 @@ def _agents_html(explanation: Explanation) -> str:
         rows.append(
             f"<tr><th>{escape(explanation.agent_names[agent])}</th>{_heat_cell(totals[agent], totals)}{cells}</tr>"
         )
-    return _table_html(f"<tr><th>agent</th><th>cost ↓</th>{head}</tr>", rows)
+    return table_html(("agent", "cost ↓", *headings), rows)
 
 
 def _strips_html(explanation: Explanation) -> str:
@@ -340,11 +323,6 @@ def _histogram_html(histogram: FeatureHistogram) -> str:
         f'<svg viewBox="0 0 {_BAR_WIDTH + 14} {_BAR_HEIGHT}" role="img" aria-label="{title}">'
         f"{''.join(bars)}{axis}{''.join(ticks)}</svg></figure>"
     )
-
-
-def _table_html(head: str, rows: list[str]) -> str:
-    table = f'<table class="results"><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table>'
-    return f'<div class="card scroll" tabindex="0">{table}</div>'
 
 
 def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:

@@ -11,12 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Float64
+from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.explain import to_scene_motion
-from rlftsim.evaluation.goal_outcomes import build_outcome_table, draw_outcomes, measure_outcomes
 from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
-from rlftsim.goals.goals_file import GoalsFile
+from rlftsim.goals.attainment import Outcome, measure_outcome
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.realism import SimulatedStates
@@ -24,8 +27,8 @@ from rlftsim.rollout.open_world import add_visitors
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.film import to_film
-from rlftsim.viewer.page import Animation, Panel, write_page
-from rlftsim.viewer.scene import build_scene, logged_trajectories
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
+from rlftsim.viewer.page import Animation, animate, write_page
 
 Exporter = Callable[[Scenario, SimulatedStates, Path], Path]
 """Called with a scenario, its rollouts and the folder of the rollouts; writes a file there and returns its path."""
@@ -44,6 +47,7 @@ EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
 """Name -> function."""
 MAX_ROLLOUTS = 8
 """Rollouts that play on a page; each adds about 50 kB."""
+PICTURE_INCHES = 7.0
 
 
 def exporter_by_name(name: str) -> Exporter:
@@ -105,12 +109,8 @@ def animate_states(
         max_rollouts: Rollouts that can be played; each adds about 50 kB to a page.
         caption: Text below the title.
     """
-    scene = build_scene(scenario)
-    panels = [Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents))]
-    for title, simulated in states.items():
-        motion = to_scene_motion(scenario, simulated).first(max_rollouts)
-        panels.append(Panel(title, motion.with_overlaps(scene.agents)))
-    return Animation(f"Scenario {scenario.scenario_id}", scene, panels, caption=caption)
+    motions = ((title, to_scene_motion(scenario, simulated).first(max_rollouts)) for title, simulated in states.items())
+    return animate(scenario, motions, caption=caption)
 
 
 def report_rollouts(
@@ -142,7 +142,7 @@ def report_rollouts(
             continue
         scenario = dataset.by_id(scenario_id)
         states = read_rollouts(_entry(folder, scenario_id), scenario)
-        outcomes += measure_outcomes(states, entries)
+        outcomes += [(e, measure_outcome(states.simulated_path(e.agent_id), (e.x, e.y))) for e in entries]
         if picture:
             pictures.append(folder / f"{scenario_id}.png")
             draw_outcomes(pictures[-1], states, scenario, entries)
@@ -185,3 +185,48 @@ def read_rollouts(entry: RolloutEntry, scenario: Scenario) -> SimulatedStates:
 def with_entrants(scenario: Scenario, states: SimulatedStates) -> Scenario:
     """The scenario with the agents that may have entered, if there are such agents among the rollouts'."""
     return add_visitors(scenario) if states.valid is not None else scenario
+
+
+def build_outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
+    """Table of goals and outcomes, for `print_wide`.
+
+    Args:
+        outcomes: Goals of any scenarios, each with its outcome.
+    """
+    headings = ("scenario", "agent", "label", "reached", "passed", "closest [m]: best", "median")
+    table = Table(
+        *headings,
+        title="goals: within 2 m in the end (reached), at any time (passed)",
+        caption="closest: smallest distance to the goal, in the best rollout and in the median one",
+        title_justify="left",
+        caption_justify="left",
+    )
+    for entry, o in outcomes:
+        numbers = (f"{o.reached:.0%}", f"{o.passed:.0%}", f"{o.best_m:.1f}", f"{o.median_m:.1f}")
+        table.add_row(entry.scenario_id, str(entry.agent_id), entry.label, *numbers)
+    return table
+
+
+def _find_path(states: SimulatedStates, agent_id: int) -> Float64[np.ndarray, "N T 2"]:
+    """Simulated path of an agent, NaN where the agent is absent."""
+    presence = states.presence[:, states.find_rows(np.array([agent_id]))[0], :, None]
+    return torch.where(presence, states.simulated_path(agent_id), torch.nan).numpy().astype(np.float64)
+
+
+def draw_outcomes(path: Path, states: SimulatedStates, scenario: Scenario, entries: Sequence[GoalEntry]) -> None:
+    """Draw goals and the simulated paths of their agents; without goals the paths of the evaluated agents.
+
+    Args:
+        path: Picture to write.
+        states: Rollouts of the scenario, world frame.
+        scenario: Scenario with the map that is drawn.
+        entries: Goals of its agents; may be empty.
+    """
+    targeted = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
+    # Without goals the picture shows the agents that the metric evaluates.
+    free = [(agent, None, "") for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist()]
+    marks = tuple(
+        DrawnGoal(agent_id, position, label, driven=_find_path(states, agent_id))
+        for agent_id, position, label in targeted or free
+    )
+    draw_goals(path, [GoalPanel(scenario.scenario_id, scenario, marks)], panel_inches=PICTURE_INCHES)

@@ -22,7 +22,7 @@ from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.jobs.runner import check_jobs
+from rlftsim.jobs.runner import check_jobs, choose_runner
 from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -57,7 +57,6 @@ def attain_goals(
     goals: Sequence[GoalEntry],
     *,
     title: str = "goals",
-    show_progress: bool = True,
 ) -> tuple[Attained, ...]:
     """Attainment of each goal by a policy, in the order of the goals.
 
@@ -68,7 +67,6 @@ def attain_goals(
         config: Rollouts, seed, sampling, split, processes.
         goals: Goals; each is pursued alone, whatever goals the scenario has besides.
         title: Name of the work, in front of the progress bar.
-        show_progress: False prints neither progress nor the time left.
 
     Raises:
         DataError: No such data set, scenario or agent, or a second process at work in the folder.
@@ -85,23 +83,12 @@ def attain_goals(
         scenario_id: measurement | {"goals": [[goal.agent_id, goal.x, goal.y] for goal in scenario_goals]}
         for scenario_id, scenario_goals in by_scenario.items()
     }
-    stored = measure_scenarios(
-        title,
-        partial(_simulate_goals, frozen_copy(policy), dataset, config, by_scenario),
-        ScenarioValues(
-            Path(out), tuple(by_scenario), identity, partial(_parse_attained, by_scenario),
-            information={"package_version": __version__},
-        ),
-        jobs=config.jobs,
-        show_progress=show_progress,
-    )  # fmt: skip
+    files = ScenarioValues(Path(out), tuple(by_scenario), identity, partial(_parse_attained, by_scenario))
+    work = partial(_simulate_goals, frozen_copy(policy), dataset, config, by_scenario)
+    stored = measure_scenarios(title, work, files, runner=choose_runner(config.jobs, len(by_scenario)))
     # Files are by scenario, goals may come in any order.
-    by_goal = {_key(attained.entry): attained for scenario_goals in stored for attained in scenario_goals}
-    return tuple(by_goal[_key(goal)] for goal in goals)
-
-
-def _key(entry: GoalEntry) -> tuple[str, int, float, float, str]:
-    return entry.scenario_id, entry.agent_id, entry.x, entry.y, entry.label
+    by_goal = {attained.entry: attained for scenario_goals in stored for attained in scenario_goals}
+    return tuple(by_goal[goal] for goal in goals)
 
 
 def _parse_attained(
@@ -130,4 +117,5 @@ def _simulate_goals(
     for goal in goals[scenario_id]:
         states = goal_free or simulate(goals=goals_of_batch([goal], batch))
         outcomes.append(measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y)))
-    return {"reached": [outcome.reached for outcome in outcomes], "passed": [outcome.passed for outcome in outcomes]}
+    reached, passed = [outcome.reached for outcome in outcomes], [outcome.passed for outcome in outcomes]
+    return {"reached": reached, "passed": passed, "package_version": __version__}

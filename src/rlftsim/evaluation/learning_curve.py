@@ -14,8 +14,8 @@ from rlftsim.training.run_folder import read_metrics
 from rlftsim.viewer.chart import Chart, Curve
 from rlftsim.viewer.figure import Interval, charts_to_png, draw_intervals, save_figure
 from rlftsim.viewer.film import Camera
-from rlftsim.viewer.page import Animation, Panel
-from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
+from rlftsim.viewer.page import animate
+from rlftsim.viewer.scene import rollout_trajectories
 
 Lines = Sequence[Mapping[str, Any]]
 """Values of each update, see `read_metrics`."""
@@ -49,12 +49,10 @@ def film_model(run: Path, policy: Policy, scenario: Scenario) -> None:
     from torch.utils.tensorboard import SummaryWriter  # not at the top: `--help` has no use for it
 
     rollouts = simulate(policy, collate([scenario]).to(get_device(policy)), num_rollouts=1, seed=0)
-    scene = build_scene(scenario)
-    motions = {"logged": logged_trajectories(scenario), "simulated": rollout_trajectories(scenario, rollouts, row=0)}
-    panels = [Panel(title, motion.with_overlaps(scene.agents)) for title, motion in motions.items()]
-    camera = Camera(Animation(f"Scenario {scenario.scenario_id}", scene, panels), FILM_DOTS_PER_INCH)
-    num_steps = min(motion.num_steps for motion in motions.values())
-    frames = [camera.frame(panels, step) for step in range(CURRENT_STEP, num_steps, FILM_STEPS)]
+    animation = animate(scenario, [("simulated", rollout_trajectories(scenario, rollouts, row=0))])
+    camera = Camera(animation, FILM_DOTS_PER_INCH)
+    num_steps = min(panel.trajectories.num_steps for panel in animation.panels)
+    frames = [camera.frame(animation.panels, step) for step in range(CURRENT_STEP, num_steps, FILM_STEPS)]
     lines = read_metrics(run)
     with SummaryWriter(str(run / "tensorboard")) as board:
         write_film(board, frames, int(lines[-1]["update"]) if lines else 0, FILM_STEPS * STEP_S)
@@ -143,15 +141,9 @@ def write_calibration_picture(model: Path) -> Path | None:
     rows = sorted(read_calibration(path)["features"], key=lambda row: -row["rmm"])
     intervals = []
     for row in rows:
-        half = 1.96 * abs(row["rmm"] / row["t"]) if row["t"] else 0.0
-        intervals.append(
-            Interval(f"{row['feature']}  {row['eta']:+.2f}", row["rmm"], row["rmm"] - half, row["rmm"] + half)
-        )
-    figure = draw_intervals(
-        intervals,
-        title="What each feature earns",
-        x_label="RMM, predicted to first order; beside the names eta",
-        zero=True,
-    )
+        half, name = 1.96 * abs(row["rmm"] / row["t"]) if row["t"] else 0.0, f"{row['feature']}  {row['eta']:+.2f}"
+        intervals.append(Interval(name, row["rmm"], row["rmm"] - half, row["rmm"] + half))
+    label = "RMM, predicted to first order; beside the names eta"
+    figure = draw_intervals(intervals, title="What each feature earns", x_label=label, zero=True)
     save_figure(model / "calibration.png", figure)
     return model / "calibration.png"

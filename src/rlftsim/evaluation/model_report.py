@@ -1,6 +1,7 @@
 """Report of evaluations: how models compare, which scenarios to look at, and the runs that made the models."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from rlftsim.evaluation.compare import compare
 from rlftsim.evaluation.learning_curve import run_charts, write_calibration_picture
 from rlftsim.evaluation.report import ChartGroup, PairedComparison, Report, ResultRow, ScenarioRow, ScenarioTable
 from rlftsim.evaluation.results import Evaluation
-from rlftsim.evaluation.scenario_pages import EvaluatedModels, ScenarioFiles, write_scenario_files
+from rlftsim.evaluation.scenario_pages import EvaluatedModels, write_scenario_files
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.training.run_folder import describe_environment, flatten, read_metrics, stored_settings
@@ -36,7 +37,6 @@ def build_report(
     num_listed: int = 10,
     num_played: int = 3,
     jobs: int = 1,
-    alpha: float = 0.05,
     title: str = "",
     summary: Sequence[str] = (),
     facts: Mapping[str, str] | None = None,
@@ -53,7 +53,6 @@ def build_report(
         num_listed: Number of the worst scenarios, and of the most changed ones, with pages and films.
         num_played: Number of scenarios that play in the report: those that gained most, and a middle one.
         jobs: Processes that write pages and films.
-        alpha: Probability of calling a difference that is none.
         title: Heading; empty = names of the evaluations.
         summary: Paragraphs below the heading.
         facts: Further facts to repeat it, by name.
@@ -63,7 +62,7 @@ def build_report(
     """
     first, *others = models.evaluations
     judged = others[0] if others else first
-    comparisons = [compare(first, other, alpha=alpha) for other in others if other.provenance.policy != "oracle"]
+    comparisons = [compare(first, other) for other in others if other.provenance.policy != "oracle"]
     rows = rank_scenarios(models.evaluations)
     changed = sorted((row for row in rows if np.isfinite(row.change)), key=lambda row: -abs(row.change))
     changed = changed[:num_listed] if others else []
@@ -72,14 +71,21 @@ def build_report(
         scenario_ids = dict.fromkeys(row.scenario_id for row in (*rows[:num_listed], *changed))
         files = write_scenario_files(models, list(scenario_ids), out, jobs=jobs)
         animations = _animate(models, rows, num_played)
-    listed = [_link_files(row, files.get(row.scenario_id)) for row in rows[:MAX_ROWS]]
+    listed, changed = (
+        [replace(row, **files.get(row.scenario_id, {})) for row in selected] for selected in (rows[:MAX_ROWS], changed)
+    )
     names = [evaluation.name for evaluation in models.evaluations]
     environment = describe_environment()
     return Report(
         title=title or f"{judged.name} against {first.name}" if others else title or first.name,
         summary=summary,
         rows=[
-            ResultRow.of(e, (*SCORES, *DRIFT_COLUMNS), note=NOTES.get(e.provenance.policy, ""), emphasized=e is judged)
+            ResultRow(
+                e.name,
+                {column.source: e.mean_and_error(column.source) for column in (*SCORES, *DRIFT_COLUMNS)},
+                NOTES.get(e.provenance.policy, ""),
+                emphasized=e is judged,
+            )
             for e in models.evaluations
         ],
         table_note=(
@@ -93,7 +99,7 @@ def build_report(
             ScenarioTable(
                 f"Most changed scenarios, {judged.name} against {first.name}",
                 names,
-                [_link_files(row, files.get(row.scenario_id)) for row in changed],
+                changed,
             ),
             ScenarioTable(
                 f"Scenarios, those in which {judged.name} loses most first",
@@ -149,12 +155,6 @@ def _animate(models: EvaluatedModels, rows: Sequence[ScenarioRow], num_played: i
             caption = f"RMM of {judged} minus {first}: {row.change:+.3f}"
         animations.append(models.animate(row.scenario_id, caption))
     return animations
-
-
-def _link_files(row: ScenarioRow, files: ScenarioFiles | None) -> ScenarioRow:
-    if files is None:
-        return row
-    return ScenarioRow(row.scenario_id, row.scores, row.lost, row.change, files.pages, files.film)
 
 
 def _describe_index(models: EvaluatedModels, rows: Sequence[ScenarioRow]) -> str:

@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 from html import escape
 from itertools import repeat
 from pathlib import Path
+from typing import Literal
 from urllib.parse import quote
 
 import numpy as np
 
 from rlftsim.evaluation.columns import COLUMNS, DRIFT_COLUMNS, Column, format_number
 from rlftsim.evaluation.compare import Comparison, paired_values
-from rlftsim.evaluation.results import Evaluation
 from rlftsim.jobs.files import write_text
 from rlftsim.statistics import MeanInterval
-from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
-from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
+from rlftsim.viewer.chart import Chart, chart_html, label_ticks
+from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset, table_html, tile_html
 
 
 @dataclass(frozen=True)
@@ -31,25 +31,10 @@ class ResultRow:
     note: str = ""
     emphasized: bool = False
 
-    @classmethod
-    def of(
-        cls, evaluation: Evaluation, columns: Sequence[Column], *, note: str = "", emphasized: bool = False
-    ) -> "ResultRow":
-        """The row of an evaluation.
-
-        Args:
-            evaluation: Evaluation of the policy.
-            columns: Columns of the table, such as `COLUMNS`.
-            note: Text below the name, in small letters.
-            emphasized: True writes the row in bold letters.
-        """
-        estimates = {column.source: evaluation.mean_and_error(column.source) for column in columns}
-        return cls(evaluation.name, estimates, note, emphasized)
-
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """Two policies on the same scenarios: mean of the differences `second - first`."""
+    """Two policies on the same scenarios: mean of the differences `second - first` in RMM."""
 
     first: str
     second: str
@@ -58,7 +43,6 @@ class PairedComparison:
     """95 %."""
     p_value: float
     num_scenarios: int
-    metric: str = "RMM"
     test: str = "paired t-test"
     differences: Sequence[float] | np.ndarray = ()
     """One per scenario; drawn where given."""
@@ -83,28 +67,23 @@ class PairedComparison:
         )
 
     @property
-    def is_better(self) -> bool:
-        """True if the whole interval lies above zero."""
-        return self.interval[0] > 0
-
-    @property
-    def is_worse(self) -> bool:
-        """True if the whole interval lies below zero."""
-        return self.interval[1] < 0
+    def tone(self) -> Literal["good", "bad", ""]:
+        """Good if the whole interval lies above zero, bad if below."""
+        return "good" if self.interval[0] > 0 else "bad" if self.interval[1] < 0 else ""
 
     @property
     def verdict_text(self) -> str:
         """`verdict`, or a sentence made from the interval."""
         if self.verdict:
             return self.verdict
-        if self.is_better or self.is_worse:
-            word, side = ("higher", "above") if self.is_better else ("lower", "below")
+        if self.tone:
+            word, side = ("higher", "above") if self.tone == "good" else ("lower", "below")
             return (
-                f"{_sentence(self.second)} scores {word} than {self.first} in {self.metric}: "
+                f"{_sentence(self.second)} scores {word} than {self.first} in RMM: "
                 f"the whole 95 % interval of the mean difference lies {side} zero."
             )
         return (
-            f"No difference in {self.metric} between {self.second} and {self.first} can be claimed: "
+            f"No difference in RMM between {self.second} and {self.first} can be claimed: "
             "the 95 % interval of the mean difference contains zero."
         )
 
@@ -211,10 +190,6 @@ def report_html(report: Report) -> str:
     return page_html(report.title, "\n".join(s for s in sections if s), extra_js=read_asset("chart.js"))
 
 
-def _measured_columns(rows: Sequence[ResultRow], columns: Sequence[Column]) -> list[Column]:
-    return [column for column in columns if any(column.source in row.estimates for row in rows)]
-
-
 def _sentence(text: str) -> str:
     """With a capital first letter."""
     return text[:1].upper() + text[1:]
@@ -225,33 +200,27 @@ def _tiles_html(report: Report) -> str:
     if not report.comparisons:
         return ""
     comparison = report.comparisons[0]
-    # the two means only where the table has them in the same unit
     tiles = []
     by_name = {row.name: row.estimates.get("meta_metric") for row in report.rows}
     for name in (comparison.first, comparison.second):
         estimate = by_name.get(name)
-        if estimate is not None and comparison.metric == "RMM" and math.isfinite(estimate.mean):
-            tiles.append(_tile_html(f"RMM, {name}", format_number(estimate.mean, 4), estimate.interval))
-    sign = "+" if comparison.mean_difference > 0 else ""
-    tone = "good" if comparison.is_better else "bad" if comparison.is_worse else ""
-    difference = sign + format_number(comparison.mean_difference, 4)
-    tiles.append(_tile_html("mean paired difference", difference, comparison.interval, tone))
+        if estimate is not None and math.isfinite(estimate.mean):
+            limits = _interval_text(estimate.interval)
+            tiles.append(tile_html(f"RMM, {name}", format_number(estimate.mean, 4), limits))
+    limits = _interval_text(comparison.interval)
+    tiles.append(tile_html("mean paired difference", _format_signed(comparison), limits, comparison.tone))
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
-def _tile_html(title: str, value: str, interval: tuple[float, float], tone: str = "") -> str:
-    # no interval over fewer than two scenarios
-    limits = f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>'
-    limits = limits if math.isfinite(interval[0]) else ""
-    return (
-        f'<div class="card tile {tone}"><div class="what">{escape(title)}</div>'
-        f'<div class="value">{value}</div>{limits}</div>'
-    )
+def _format_signed(comparison: PairedComparison) -> str:
+    sign = "+" if comparison.mean_difference > 0 else ""
+    return sign + format_number(comparison.mean_difference, 4)
 
 
-def _interval_text(interval: tuple[float, float], digits: int) -> str:
-    low, high = (format_number(value, digits) for value in interval)
-    return f"{low} to {high}"
+def _interval_text(interval: tuple[float, float]) -> str:
+    """Both ends in words; empty without an interval, as over fewer than two scenarios."""
+    low, high = (format_number(value, 4) for value in interval)
+    return f"95 % interval {low} to {high}" if math.isfinite(interval[0]) else ""
 
 
 _ERRORS = "Mean ± standard error over scenarios; point at a number for its 95 % interval."
@@ -264,13 +233,10 @@ _DRIFT_MEANS = (
 
 def _table_html(title: str, rows: Sequence[ResultRow], columns: Sequence[Column], note: str) -> str:
     """A table with a heading and a note below; empty where no row has any of the columns."""
-    columns = _measured_columns(rows, columns)
+    columns = [column for column in columns if any(column.source in row.estimates for row in rows)]
     if not columns:
         return ""
-    headings = "".join(
-        f'<th scope="col"><abbr title="{escape(c.meaning)}; {c.direction_text}">{escape(c.label)}</abbr></th>'
-        for c in columns
-    )
+    headings = [f'<abbr title="{escape(c.meaning)}; {c.direction_text}">{escape(c.label)}</abbr>' for c in columns]
     body = []
     for row in rows:
         below = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
@@ -278,9 +244,7 @@ def _table_html(title: str, rows: Sequence[ResultRow], columns: Sequence[Column]
         cells = "".join(_cell_html(column, row.estimates.get(column.source)) for column in columns)
         body.append(f'<tr{style}><th scope="row">{escape(row.name)}{below}</th>{cells}</tr>')
     return (
-        f'<h2>{escape(title)}</h2><div class="card scroll" tabindex="0"><table class="results"><thead><tr>'
-        f'<th scope="col">policy</th>{headings}</tr></thead>'
-        f"<tbody>{''.join(body)}</tbody></table></div>"
+        f"<h2>{escape(title)}</h2>{table_html(['policy', *headings], body)}"
         f'<p class="note" style="margin-top:10px">{escape(note.strip())}</p>'
     )
 
@@ -299,8 +263,8 @@ def _cell_html(column: Column, estimate: MeanInterval | None) -> str:
 def _scenarios_html(table: ScenarioTable) -> str:
     """Scenarios by rows; a score is a link to the page that explains the score, where there is one."""
     has_films = any(row.film for row in table.rows)
-    headings = (*table.names, "lost ↓", *(["change"] if len(table.names) > 1 else []), *(["film"] if has_films else []))
-    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in ("scenario", *headings))
+    headings = ("scenario", *map(escape, table.names), "lost ↓", *(["change"] if len(table.names) > 1 else []))
+    headings = (*headings, *(["film"] if has_films else []))
     body = []
     for row in table.rows:
         scores = [_link(page, format_number(score, 4)) for score, page in zip(row.scores, row.pages or repeat(""))]
@@ -309,10 +273,7 @@ def _scenarios_html(table: ScenarioTable) -> str:
         texts = "".join(f"<td>{'–' if cell == 'nan' or cell == '+nan' else cell}</td>" for cell in cells)
         body.append(f'<tr><th scope="row">{escape(row.scenario_id)}</th>{texts}</tr>')
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    return (
-        f'<h2>{escape(table.title)}</h2>{note}<div class="card scroll long" tabindex="0"><table class="results">'
-        f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
-    )
+    return f"<h2>{escape(table.title)}</h2>{note}{table_html(headings, body, is_long=True)}"
 
 
 def _picture_html(path: Path, title: str) -> str:
@@ -327,12 +288,11 @@ def _link(address: str, text: str) -> str:
 
 def _comparison_html(comparison: PairedComparison) -> str:
     p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
-    sign = "+" if comparison.mean_difference > 0 else ""
-    tested = f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "
+    tested = f"{_interval_text(comparison.interval)}, {p_text} ({escape(comparison.test)}), "
     return (
         f"<h2>{escape(_sentence(comparison.second))} against {escape(comparison.first)}, scenario by scenario</h2>"
         f'<div class="card comparison"><div><p class="verdict">{escape(comparison.verdict_text)}</p>'
-        f"<p>Mean difference in {escape(comparison.metric)} {sign}{format_number(comparison.mean_difference, 4)}, "
+        f"<p>Mean difference in RMM {_format_signed(comparison)}, "
         f"{tested if math.isfinite(comparison.p_value) else ''}"
         f"{comparison.num_scenarios} scenarios.</p></div>{_difference_svg(comparison)}</div>"
     )
@@ -353,11 +313,8 @@ def _difference_svg(comparison: PairedComparison) -> str:
     def across(value: float) -> float:
         return margin + (value - low) / (high - low) * (width - 2 * margin)
 
-    tone = "var(--good)" if comparison.is_better else "var(--bad)" if comparison.is_worse else "var(--accent)"
-    shapes = []
-    ticks = nice_ticks(low, high, 6)
-    for tick in ticks:
-        label = format_tick(tick, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
+    tone, shapes = f"var(--{comparison.tone or 'accent'})", []
+    for tick, label in label_ticks(low, high, 6):
         shapes.append(f'<path class="tick" d="M{across(tick):.1f} {base}v5"/>')
         shapes.append(f'<text x="{across(tick):.1f}" y="{base + 18}" text-anchor="middle">{label}</text>')
     shapes.append(f'<path class="axis" d="M{margin} {base}H{width - margin}"/>')

@@ -1,21 +1,22 @@
 """Interruptible measurements of many scenarios: finished groups are stored in files, a later call does the others.
 
 Evaluations and scores of rollout files are stored as `ScenarioRows` (Parquet), goal attainment, reward variances and
-planners as `ScenarioValues` (JSON). A `Claim` is the right to join the groups in the file of a result.
+planners as `ScenarioValues` (JSON). `make_result` joins the groups in the file of a result.
 """
 
 import json
+import math
 import re
 import tempfile
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import pyarrow as pa
 
@@ -58,14 +59,12 @@ class ScenarioValues(ScenarioFormat[Stored, Mapping[str, object]]):
     """By scenario id: plain values that a file must agree with to belong to this work."""
     parse: Callable[[str, Mapping[str, Any]], Stored]
     """Reads a scenario's values; a KeyError, TypeError or ValueError means that the file is damaged."""
-    information: Mapping[str, object] = field(default_factory=dict)
-    """Written into each file and not compared."""
 
     def write(self, item: range, results: Sequence[Mapping[str, object]]) -> None:
         """Write the file of a scenario, see `GroupFormat`."""
         scenario_id = self.scenario_ids[item.start]
-        values = {**self.identity[scenario_id], **results[0], **self.information}
-        write_text(self.folder / f"{scenario_id}.json", json.dumps(values) + "\n")
+        text = json.dumps({**self.identity[scenario_id], **results[0]})
+        write_text(self.folder / f"{scenario_id}.json", f"{text}\n")
 
     def read(self, item: range) -> Stored | None:
         """The parsed values of a scenario, see `ResultFormat`."""
@@ -169,10 +168,6 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         # counted: a scenario may have several sets of rollouts in files, and one by a policy
         return stored if counts == Counter(scenario_ids) else None
 
-    def join(self, groups: list[Evaluation]) -> Evaluation:
-        """The evaluation of the scenarios of all groups."""
-        return join_evaluations(self.name, self.provenance, groups)
-
     def file_names(self, scenario_ids: Collection[str]) -> list[str]:
         """Names of groups of any size, see `ScenarioFormat`."""
         return [path.name for path in self.folder.glob("*.parquet") if _GROUP_NAME.fullmatch(path.stem)]
@@ -197,8 +192,7 @@ def measure_scenarios(
     work: Callable[[int], Mapping[str, object]],
     format: ScenarioValues[Stored],
     *,
-    jobs: int,
-    show_progress: bool = True,
+    runner: Runner,
 ) -> list[Stored]:
     """Values of all scenarios, whose files stay in the folder: measured now, or read from there.
 
@@ -206,16 +200,15 @@ def measure_scenarios(
         title: Name of the work, in front of the progress bar.
         work: Function from the position of a scenario to the values that are stored.
         format: Files of the scenarios.
-        jobs: Number of processes; changes no result.
-        show_progress: False prints neither progress nor the time left.
+        runner: Runner of the scenarios that are missing; changes no result.
 
     Raises:
         NotYetError: A second process at work in the folder.
-        SetAside: See `run_items`.
+        SetAside, Unfinished: See `run_items`.
     """
-    runner = choose_runner(jobs, len(format.scenario_ids))
     with Lease(format.folder / ".lock", runner, "works in") as lease:
-        stored = run_groups(title, format.scenario_ids, work, format, lease, runner, show_progress=show_progress)
+        stored = run_groups(title, format.scenario_ids, work, format, lease, runner)
+        remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
         lease.remove()
     return stored
 
@@ -257,25 +250,15 @@ class Writable(Protocol):
 FinishedResult = TypeVar("FinishedResult", bound=Writable)
 
 
-@dataclass(eq=False)
-class Claim(Generic[FinishedResult]):
-    """The right to make a result, or the result that an earlier call has finished."""
-
-    result: FinishedResult | None
-    """None until the missing result is made."""
-    lease: Lease | None
-    """Lock on the folder of the groups; None where the result is finished."""
-
-
-@contextmanager
-def claim_result(
+def make_result(
     path: Path,
     format: ScenarioFormat[Any, Any],
     scenario_ids: Sequence[str],
     find: Callable[[], FinishedResult | None],
     runner: Runner,
-) -> Iterator[Claim[FinishedResult]]:
-    """Hold the right to make a result for the time of a block, after which the new result is written.
+    make: Callable[[Lease], FinishedResult],
+) -> FinishedResult:
+    """The result that an earlier call has finished, or else a new one, which is written into its file.
 
     Args:
         path: File of the result.
@@ -284,6 +267,7 @@ def claim_result(
         scenario_ids: Ids of all scenarios of the result.
         find: Reader of the finished result; returns None for a missing result.
         runner: Runner of the groups that are missing; changes no result.
+        make: Maker of the missing result, called with the lock on the folder of the groups.
 
     Raises:
         DataError: A second driver at work on this result.
@@ -291,49 +275,65 @@ def claim_result(
     check_folder(path.parent, "results")
     stamp, stored = _stamp(path), find()
     if stored is not None:
-        yield Claim(stored, None)
         if format.folder.exists():
             with suppress(DataError), Lease(format.folder / ".lock", Inline(), "works in"):
                 _remove_groups(format, scenario_ids, runner)
-        return
+        return stored
     with Lease(format.folder / ".lock", runner, "works in") as lease:
         # another driver may have finished since, so what would be replaced is looked at again
-        stored = find() if _stamp(path) != stamp else None
-        claim = Claim(stored, lease if stored is None else None)
-        yield claim
-        if claim.lease is not None and claim.result is not None:
+        result = find() if _stamp(path) != stamp else None
+        if result is None:
+            result = make(lease)
             remove_temporaries([path])
-            claim.result.write(path)
+            result.write(path)
         # Only now: an interruption between the two leaves the groups, and the next call finds the result.
         _remove_groups(format, scenario_ids, runner)
+    return result
 
 
-@contextmanager
-def claim_evaluation(
-    name: str, provenance: Provenance, out: str | PathLike[str] | None, scenario_ids: Sequence[str], runner: Runner
-) -> Iterator[tuple[ScenarioRows, Claim[Evaluation]]]:
-    """Hold the right to make the evaluation `out/<name>.parquet`; yields the files of groups, too.
+def make_evaluation(
+    verb: str,
+    name: str,
+    provenance: Provenance,
+    out: str | PathLike[str] | None,
+    scenario_ids: Sequence[str],
+    work: Callable[[int], Mapping[str, object] | Skipped],
+    *,
+    runner: Runner | None,
+    jobs: int,
+    show_progress: bool,
+) -> Evaluation:
+    """The evaluation in `out/<name>.parquet`, whose missing groups are done now.
 
     Args:
+        verb: Name of the work, in front of the evaluation's name and the progress bar.
         name: Name of the evaluation and of the file.
         provenance: Values that a stored result must agree with, else the call ends with an error.
         out: Folder of the result; None stores no file.
         scenario_ids: Ids of all scenarios of the evaluation, in the order of the rows.
-        runner: Runner of the groups that are missing; changes no result.
+        work: Function from the position of a scenario to the row of the scenario.
+        runner: Runner of the groups that are missing; changes no result. None = as many processes as `jobs`.
+        jobs: Number of processes that share the work.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
         ConfigError: A name that no file can have, a stored result of other work, a limit that would leave out stored
             scenarios, or shares without a folder to meet in.
         DataError: A second driver at work on this evaluation.
     """
+    runner = runner or choose_runner(jobs, math.ceil(len(scenario_ids) / ScenarioRows.items_per_file))
     if out is None and isinstance(runner, Share | Joining):
         raise ConfigError("shares meet in a folder: name one with --out.")
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
     with tempfile.TemporaryDirectory() as temporary_folder:
         rows = ScenarioRows(name, provenance, validate_folder(temporary_folder if out is None else out))
         find = partial(rows.read_finished, scenario_ids)
-        with claim_result(rows.result_path, rows, scenario_ids, find, runner) as claim:
-            yield rows, claim
+
+        def make(lease: Lease) -> Evaluation:
+            groups = run_groups(f"{verb} {name}", scenario_ids, work, rows, lease, runner, show_progress=show_progress)
+            return join_evaluations(name, provenance, groups)
+
+        return make_result(rows.result_path, rows, scenario_ids, find, runner, make)
 
 
 def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:

@@ -23,7 +23,7 @@ from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
-from rlftsim.jobs.runner import check_jobs
+from rlftsim.jobs.runner import check_jobs, choose_runner
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.realism import compute_mloo
@@ -55,8 +55,6 @@ def measure_variances(
     data: str | PathLike[str] | ScenarioDataset,
     out: str | PathLike[str],
     config: EvaluateConfig,
-    *,
-    show_progress: bool = True,
 ) -> Variances:
     """Variances of a policy's rewards for each number of rollouts in `SIZES`, up to the settings' number.
 
@@ -65,7 +63,6 @@ def measure_variances(
         data: Folder of a data set, "synthetic", or an opened data set.
         out: Folder of the results, a JSON file per scenario, made if missing.
         config: Rollouts, seed, sampling, scenarios, processes.
-        show_progress: False prints neither progress nor the time left.
 
     Raises:
         ConfigError: Too few rollouts for a slope.
@@ -81,13 +78,9 @@ def measure_variances(
     check_jobs(config.jobs, get_device(policy))
     ids = choose_scenarios(dataset, config)
     identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
-    stored = measure_scenarios(
-        "variances",
-        partial(_measure_scenario, frozen_copy(policy), dataset, config, sizes),
-        ScenarioValues(Path(out), ids, dict.fromkeys(ids, identity), _parse_variances),
-        jobs=config.jobs,
-        show_progress=show_progress,
-    )
+    files = ScenarioValues(Path(out), ids, dict.fromkeys(ids, identity), _parse_variances)
+    work = partial(_measure_scenario, frozen_copy(policy), dataset, config, sizes)
+    stored = measure_scenarios("variances", work, files, runner=choose_runner(config.jobs, len(ids)))
     # [rewards, sizes] each; a scenario that cannot be scored has an empty array
     scored = {scenario_id: values for scenario_id, values in zip(ids, stored) if len(values)}
     if not scored:

@@ -8,6 +8,7 @@ import torch
 
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.goals.types import Goals, logged_goals
+from rlftsim.jobs.items import group_positions
 from rlftsim.realism import SimulatedStates
 from rlftsim.realism.from_rollouts import logged_states, prepend_history, states_of_rollouts
 from rlftsim.rollout.policy import Policy, get_device
@@ -39,13 +40,11 @@ def simulate_states(
         with torch.no_grad():
             context = policy.encode(batch)
     is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
-    ids = range(config.num_rollouts if is_random else 1)
     passes = []
-    for first in range(0, len(ids), config.rollouts_per_pass):
+    for ids in group_positions(config.num_rollouts if is_random else 1, config.rollouts_per_pass):
         # Noise belongs to rollout ids, so the passes together draw what a single pass would.
         rollouts = simulate(
-            policy, batch, num_rollouts=ids[first : first + config.rollouts_per_pass], seed=config.seed,
-            context=context, sampling=config.sampling, goals=goals,
+            policy, batch, num_rollouts=ids, seed=config.seed, context=context, sampling=config.sampling, goals=goals,
         )  # fmt: skip
         passes.append(states_of_rollouts(batch, rollouts)[0])
     joined = _join_passes(passes)
@@ -74,8 +73,7 @@ def generate_states(policy: Policy, scenario: Scenario, config: EvaluateConfig) 
         DataError: A pose of the policy that is not finite.
     """
     scenes = []
-    for first in range(0, config.num_rollouts, config.rollouts_per_pass):
-        numbers = range(first, min(first + config.rollouts_per_pass, config.num_rollouts))
+    for numbers in group_positions(config.num_rollouts, config.rollouts_per_pass):
         histories = [draw_scene(scenario, rollout, seed=config.seed) for rollout in numbers]
         batch = collate(histories).to(get_device(policy))
         rollouts = simulate(policy, batch, num_rollouts=1, seed=config.seed, sampling=config.sampling)

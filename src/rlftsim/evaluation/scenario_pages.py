@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rlftsim import __version__
 from rlftsim.evaluation.explain import explain
@@ -59,18 +60,9 @@ class EvaluatedModels:
         return animate_states(scenario, states, max_rollouts=ROLLOUTS_SHOWN, caption=caption)
 
 
-@dataclass(frozen=True)
-class ScenarioFiles:
-    """Addresses of what there is to look at, beside the report."""
-
-    pages: Sequence[str]
-    """Page of each evaluation; empty = none."""
-    film: str
-
-
 def write_scenario_files(
     models: EvaluatedModels, scenario_ids: Sequence[str], out: Path, *, jobs: int = 1
-) -> dict[str, ScenarioFiles]:
+) -> dict[str, dict[str, Any]]:
     """Write a page for each model at hand, and a film of all, of each scenario. A call that was interrupted goes on.
 
     Args:
@@ -78,6 +70,9 @@ def write_scenario_files(
         scenario_ids: Scenarios to look at.
         out: Folder of the report; the files are in `FOLDER` inside.
         jobs: Processes that share the work, with models on CPUs.
+
+    Returns:
+        Addresses of `pages`, one of each evaluation (empty = none), and of the `film`, by scenario.
 
     Raises:
         DataError: A scenario that the data set does not have.
@@ -94,7 +89,7 @@ def write_scenario_files(
             items[pages[position]] = (scenario_id, position)
         items[f"{name}.mp4"] = (scenario_id, None)
         addresses = [f"{FOLDER}/{page}" if page else "" for page in pages]
-        files[scenario_id] = ScenarioFiles(addresses, f"{FOLDER}/{name}.mp4")
+        files[scenario_id] = {"pages": addresses, "film": f"{FOLDER}/{name}.mp4"}
     identity = repr((
         [(e.name, e.provenance.what_counts()) for e in models.evaluations], sorted(models.policies),
         hash_manifest(models.dataset.folder), list(items), __version__,

@@ -68,20 +68,12 @@ def hash_manifest(folder: Path) -> str:
     return hash_file(folder / MANIFEST)
 
 
-@dataclass(frozen=True)
-class RecordSpan:
-    """Location of a record's bytes."""
-
-    file: Path
-    offset: int
-    length: int
-
-
 @dataclass(frozen=True, eq=False)
 class LoggedScenarios:
     """The scenarios of tfrecord files, parsed one by one when read."""
 
-    spans: dict[str, RecordSpan]
+    spans: dict[str, tuple[Path, int, int]]
+    """File, first byte and number of bytes of each record, by scenario id."""
     fingerprint: str
     sources: tuple[str, ...] = ("womd",)
     guessed: tuple[str, ...] = ()
@@ -100,14 +92,14 @@ class LoggedScenarios:
         """
         if scenario_id not in self.spans:
             raise DataError(f"no scenario {scenario_id!r} among {len(self)} logged ones")
-        span = self.spans[scenario_id]
-        with span.file.open("rb") as file:
-            file.seek(span.offset)
-            data = file.read(span.length)
+        path, offset, length = self.spans[scenario_id]
+        with path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(length)
         try:
             return scenario_from_bytes(data)
         except DataError as error:
-            raise DataError(f"{span.file}: scenario {scenario_id}: {error}") from error
+            raise DataError(f"{path}: scenario {scenario_id}: {error}") from error
 
     def find_cluster(self, scenario_id: str) -> str | None:
         """None: records do not name the recording."""
@@ -140,7 +132,7 @@ def index_tfrecords(source: Path) -> LoggedScenarios:
     Raises:
         DataError: No such files, or a damaged record (a conversion that skips errors makes a data set of the others).
     """
-    spans: dict[str, RecordSpan] = {}
+    spans: dict[str, tuple[Path, int, int]] = {}
     digest = hashlib.sha256()
     for path in find_tfrecords(source):
         # A record is length (8 bytes), checksum (4), data, checksum (4): its data begin after a header of 12 bytes.
@@ -150,7 +142,7 @@ def index_tfrecords(source: Path) -> LoggedScenarios:
             if scenario_id is None:
                 raise DataError(f"{path}: record {record}: not a WOMD Scenario message, it has no scenario_id")
             # of a scenario that occurs twice the first is taken, as by the converter
-            spans.setdefault(scenario_id, RecordSpan(path, offset + _HEADER_BYTES, len(data)))
+            spans.setdefault(scenario_id, (path, offset + _HEADER_BYTES, len(data)))
             offset += len(data) + RECORD_OVERHEAD_BYTES
             digest.update(data)
     return LoggedScenarios(spans, digest.hexdigest())

@@ -19,12 +19,13 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import ScenarioRows, claim_evaluation, run_groups
+from rlftsim.evaluation.resumable import make_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
+from rlftsim.jobs.documents import to_finite
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
+from rlftsim.jobs.runner import Runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
 from rlftsim.realism.config import is_reported, official_buckets, official_fields
 from rlftsim.realism.map_based import select_polylines
@@ -121,16 +122,12 @@ def score_rollouts(
     )
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
     ids, work = [entry.scenario_id for entry in entries], partial(_score_entry, entries, source, config, num_rollouts)
-    runner = runner or choose_runner(config.num_jobs, math.ceil(len(entries) / ScenarioRows.items_per_file))
-    with claim_evaluation(name, provenance, out, ids, runner) as (rows, claim):
-        if claim.lease is not None:
-            claim.result = rows.join(
-                run_groups(f"score {name}", ids, work, rows, claim.lease, runner, show_progress=show_progress)
-            )
-    assert claim.result is not None
+    result = make_evaluation(
+        "score", name, provenance, out, ids, work, runner=runner, jobs=config.num_jobs, show_progress=show_progress
+    )
     # The result may be a stored one, made under missing_map="skip".
-    _check_maps(claim.result.skipped, config)
-    return claim.result
+    _check_maps(result.skipped, config)
+    return result
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
@@ -255,7 +252,8 @@ def _check_maps(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
 
 
 def _official_fields(values: dict[str, Any], metric: MetricConfig) -> dict[str, Any]:
-    def named(names: dict[str, str]) -> dict[str, float | None]:
-        return {official: values[c] if math.isfinite(values[c]) else None for c, official in names.items()}
-
-    return {**named(official_fields(metric)), "buckets": named(official_buckets(metric))}
+    fields, buckets = (
+        {official: values[column] for column, official in names.items()}
+        for names in (official_fields(metric), official_buckets(metric))
+    )
+    return to_finite({**fields, "buckets": buckets})

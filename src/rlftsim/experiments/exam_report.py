@@ -9,8 +9,9 @@ from typing import Any
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, find_direction
 from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
 from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Ledger, Margin
-from rlftsim.experiments.results import format_origin, to_finite
+from rlftsim.experiments.results import format_origin
 from rlftsim.experiments.tables import TextTable, build_table
+from rlftsim.jobs.documents import to_finite
 from rlftsim.jobs.files import write_text
 from rlftsim.training.run_folder import describe_environment, to_plain
 

@@ -6,7 +6,6 @@ A new experiment is two functions: `run` trains and evaluates, `summarize` makes
 """
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.tables import TextTable
+from rlftsim.jobs.documents import to_finite
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.training.run_folder import describe_environment, to_plain
@@ -140,13 +140,3 @@ def _format_page(
 def format_origin(environment: Mapping[str, Any]) -> str:
     """Command and commit of an environment, for the notes of a page."""
     return f"`{environment['command']}`, commit {environment['commit'] or 'of an installed package'}"
-
-
-def to_finite(value: Any) -> Any:
-    """Value for JSON, with None for numbers that are not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): to_finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_finite(item) for item in value]
-    # JSON has no NaN or infinity.
-    return None if isinstance(value, float) and not math.isfinite(value) else value

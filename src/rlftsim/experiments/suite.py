@@ -41,9 +41,6 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.training.parallel import uses_cuda
 from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
 
-GOALS_SUFFIX: Mapping[GoalChoice, str] = {"none": "", "logged": "-logged-goals"}
-"""End of the names of evaluations."""
-
 
 @dataclass(frozen=True)
 class Stage:
@@ -127,14 +124,8 @@ class ExperimentSuite:
         # trained on: both are opened before anything is written.
         _ = self.training
         ScenarioDataset(self.data, self.evaluation.split)
-        self._open_folder(writes=False)
-
-    def _open_folder(self, *, writes: bool) -> None:
-        """Refuse a folder of a suite with other settings; with `writes` make the folder this suite's.
-
-        Writing waits for the first stage, so that a suite that is refused before has not claimed the folder.
-        """
-        RunFolder(self.out, self._identity(), writes=writes)
+        # A folder of other settings is refused; writing waits for the first stage, as the suite may be refused before.
+        RunFolder(self.out, self._identity(), writes=False)
 
     @cached_property
     def training(self) -> ScenarioDataset:
@@ -154,7 +145,7 @@ class ExperimentSuite:
             rows: Specifications by row: a single model, or the same model with several seeds.
             goals: Goals of the evaluated agents: "none", or "logged" for the logged endpoints.
         """
-        self._open_folder(writes=True)
+        RunFolder(self.out, self._identity(), writes=True)
         config, folder = replace(self.evaluation, goals=goals), self.out / "evaluations"
         evaluations: dict[ModelSpec, Evaluation] = {}
 
@@ -220,7 +211,7 @@ class ExperimentSuite:
 
     def models(self, specs: Sequence[ModelSpec]) -> dict[ModelSpec, str]:
         """Names or folders of policies, for `load_policy_or_oracle`; models that are missing are trained."""
-        self._open_folder(writes=True)
+        RunFolder(self.out, self._identity(), writes=True)
         run_stages([stage for spec in specs for stage in self._training_stages(spec)])
         return {spec: self._find_model(spec) for spec in specs}
 
@@ -252,7 +243,7 @@ class ExperimentSuite:
         if isinstance(spec, Guided):
             return f"{self.evaluation_name(spec.of, goals)}-guided-{spec.scale:g}"
         epochs = f"-{self._epochs(spec):g}-epochs" if isinstance(spec, FineTuned) else ""
-        return f"{spec.name}{epochs}{GOALS_SUFFIX[goals]}"
+        return f"{spec.name}{epochs}{'' if goals == 'none' else f'-{goals}-goals'}"
 
     # ---- stages ---------------------------------------------------------------------------------------------------
 

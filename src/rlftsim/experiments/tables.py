@@ -8,6 +8,7 @@ draw_gains(base, [tuned, imitated])            paired differences with intervals
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,15 @@ class TextTable:
         for cells in self.rows:
             table.add_row(*cells)
         return table
+
+
+def load_published(name: str) -> TextTable:
+    """Table of the paper, to be shown beside ours, by the heading of a section of `paper/published.md`."""
+    text = (resources.files("rlftsim.experiments.paper") / "published.md").read_text(encoding="utf-8")
+    (_, general_note), *sections = (section.split("\n\n") for section in text.strip().split("\n\n## "))
+    title, table, *notes = next(paragraphs for heading, *paragraphs in sections if heading == name)
+    headings, _, *rows = (tuple(cell.strip() for cell in line.split("|")[1:-1]) for line in table.split("\n"))
+    return TextTable(f"The paper: {title}", headings, tuple(rows), " ".join((general_note, *notes)))
 
 
 def build_table(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextTable:

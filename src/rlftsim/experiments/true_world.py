@@ -84,18 +84,17 @@ def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
     return Episodes(traffic, planners, tuple(windows), networks, conflicts, values)
 
 
-def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int, seed: int = 0) -> Float[np.ndarray, "D W"]:
+def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int) -> Float[np.ndarray, "D W"]:
     """Equal weights, then weights of draws of clusters, see `draw_clusters`; NaN draws for a single cluster.
 
     Args:
         clusters: Number of each window's cluster, from 0 on.
         num_draws: Draws after the equal weights.
-        seed: Seed of the draws.
     """
     count = int(clusters.max()) + 1
     if count == 1:  # a single network says nothing about others
         return np.concatenate([np.ones((1, len(clusters))), np.full((num_draws, len(clusters)), np.nan)])
-    draws = draw_clusters(count, num_draws, np.random.default_rng(seed))
+    draws = draw_clusters(count, num_draws, np.random.default_rng(0))
     return np.concatenate([np.ones((1, len(clusters))), draws[:, clusters]])
 
 

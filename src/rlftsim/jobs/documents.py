@@ -8,7 +8,7 @@ import math
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from errno import ESPIPE
 from itertools import chain
@@ -153,6 +153,15 @@ def read_toml(
 def describe_type(value: object) -> str:
     """Type of a value of JSON or TOML in words, for messages."""
     return _TYPE_NAMES.get(type(value), "a number")
+
+
+def to_finite(value: Any) -> Any:
+    """Value for JSON, with None for numbers that are not finite, which JSON does not have."""
+    if isinstance(value, Mapping):
+        return {str(key): to_finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def first_line(problem: BaseException) -> str:

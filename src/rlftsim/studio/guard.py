@@ -85,11 +85,11 @@ class Guard:
         if scope["type"] != "http":  # no route is a WebSocket
             return await send({"type": "websocket.close", "code": 1008})
         headers = Headers(scope=scope)
-        refusal = self._find_refusal(scope, headers)
+        offered = parse_qs(scope["query_string"].decode("latin-1")).get("token", []) if scope["path"] == "/" else []
+        refusal = self._find_refusal(scope, headers, offered)
         if refusal is not None:
             return await self._answer(send, *refusal)
-        offered = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
-        if scope["path"] == "/" and offered:
+        if offered:
             # The address bar, the history and logs of proxies must not keep the token.
             cookie = f"{self.access.cookie}={self.access.token}; HttpOnly; SameSite=Strict; Path=/"
             return await self._answer(send, 303, "", {"location": "./", "set-cookie": cookie})
@@ -103,7 +103,7 @@ class Guard:
                 break
         await self.app(scope, _replay(body, receive), self._with_headers(send))
 
-    def _find_refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
+    def _find_refusal(self, scope: Scope, headers: Headers, offered: list[str]) -> tuple[int, str] | None:
         """Status and sentence for a request that is not let through."""
         hosts, is_change = headers.getlist("host"), scope["method"] not in SAFE_METHODS
         if len(hosts) != 1 or hosts[0].lower() not in self.access.hosts:
@@ -111,8 +111,7 @@ class Guard:
         bearer = headers.get("authorization", "").partition("Bearer ")[2]
         # Not the standard library's parser: one odd cookie of another program on this host would hide all others.
         cookies = [cookie_parser(line).get(self.access.cookie, "") for line in headers.getlist("cookie")]
-        in_url = parse_qs(scope["query_string"].decode("latin-1")).get("token", []) if scope["path"] == "/" else []
-        if not any(self.access.is_token(word) for word in (bearer, *cookies, *in_url)):
+        if not any(self.access.is_token(word) for word in (bearer, *cookies, *offered)):
             return 401, "no token, or that of an earlier start: open the address that `rlftsim studio` printed."
         if is_change:
             # "null", or a scheme and a host; a script that knows the token has none.

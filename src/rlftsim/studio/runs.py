@@ -30,7 +30,7 @@ from rlftsim.studio.bodies import RunBody
 from rlftsim.studio.encoding import encode_batch
 from rlftsim.studio.scoring import Scored, score_variant
 from rlftsim.studio.session import Session
-from rlftsim.studio.variants import Variant, build_variants, free_variant, has_goals
+from rlftsim.studio.variants import Variant, build_variants, free_variant
 
 FIRST_CHUNKS = (4, 4, 8, 16)
 LARGEST_CHUNK = 32
@@ -233,8 +233,10 @@ class Worker:
             simulated.append(self._simulated.setdefault(variant, Simulated()))
             self._simulated.move_to_end(variant)
         # The first chunk of every variant, then the rest; goal-free rollouts only matter for the score, so they end.
+        with_goals = {variant.model for variant in variants if variant.goals}
+        is_late = [not variant.goals and variant.model in with_goals for variant in variants]
         chunks = [(v, ids) for ids in split_rollouts(body.num_rollouts) for v in range(len(variants))]
-        chunks.sort(key=lambda chunk: free_variant(variants, chunk[0]) == chunk[0] and has_goals(variants, chunk[0]))
+        chunks.sort(key=lambda chunk: is_late[chunk[0]])
         return Run(name, body, variants, tuple(simulated), chunks)
 
     def _work(self) -> None:
@@ -329,9 +331,7 @@ class Worker:
             simulated.scored[key] = score_variant(scenario, run.rollouts(v), run.variants[v].goals, body.metric)
         # The change of realism is known once the model's rollouts without goals are there, too; they come last.
         free = free_variant(run.variants, v)
-        with_goals = [
-            i for i in range(len(run.variants)) if free == v and i != v and free_variant(run.variants, i) == v
-        ]
-        for variant in (v, *with_goals):
+        others = [i for i in range(len(run.variants)) if free == v and i != v and free_variant(run.variants, i) == v]
+        for variant in (v, *others):
             base = run.simulated[free].scored.get(key) if variant != free else None
             run.tell("score", variant=variant, **run.simulated[variant].scored[key].to_payload(base))

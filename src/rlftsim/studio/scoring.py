@@ -11,6 +11,7 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import Explanation, explain
 from rlftsim.goals.attainment import Outcome, measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
+from rlftsim.jobs.documents import to_finite
 from rlftsim.realism import FEATURE_NAMES, SimulatedStates, metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -66,16 +67,18 @@ class Scored:
         (official,), (ceiling,) = result.to_official_fields(), top_result.to_official_fields()
         weights, costs = explanation.config.weights, explanation.cost.sum((1, 2))
         features = zip(FEATURE_NAMES, weights, result.likelihoods, top_result.likelihoods, costs)
-        return {
-            "metric": explanation.config.name,
-            "official": _plain(official),
-            "ceiling": _plain(ceiling),
-            "lost": explanation.lost,
-            "features": [
-                {"name": name, "weight": weight, "value": _number(value), "ceiling": _number(top), "lost": float(cost)}
-                for name, weight, value, top, cost in features
-            ],
-        }
+        return to_finite(
+            {
+                "metric": explanation.config.name,
+                "official": official,
+                "ceiling": ceiling,
+                "lost": explanation.lost,
+                "features": [
+                    {"name": name, "weight": weight, "value": float(value), "ceiling": float(top), "lost": float(cost)}
+                    for name, weight, value, top, cost in features
+                ],
+            }
+        )
 
     @cached_property
     def _events(self) -> list[list[Any]]:
@@ -160,16 +163,3 @@ def compute_change(scored: Scored, free: Scored) -> dict[str, float] | None:
     variance = (count - 1) / count * (changes - changes.mean()).square().sum()
     low, high = interval_around(mean, math.sqrt(float(variance)), count).interval
     return {"mean": mean, "margin": (high - low) / 2}
-
-
-def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """Official fields with None for values that are not finite."""
-    return {
-        name: _plain(value) if isinstance(value, dict) else value if isinstance(value, str) else _number(value)
-        for name, value in fields.items()
-    }
-
-
-def _number(value: Any) -> float | None:
-    number = float(value)
-    return number if math.isfinite(number) else None

@@ -89,10 +89,8 @@ def _add_page(app: FastAPI) -> None:
 
 
 def _add_scenarios(app: FastAPI, session: Session) -> None:
-    @app.get("/api/session")
-    def _describe() -> dict[str, Any]:
-        """Versions, models and data."""
-        return session.describe()
+    app.get("/api/session")(session.describe)
+    app.get("/api/proposals/{split}/{scenario_id}/{agent}")(session.proposals)
 
     @app.get("/api/alive")
     def _alive() -> dict[str, Any]:
@@ -110,11 +108,6 @@ def _add_scenarios(app: FastAPI, session: Session) -> None:
     def _scene(split: str, scenario_id: str) -> Response:
         """Scene and log."""
         return Response(session.scene(split, scenario_id), media_type="application/json")
-
-    @app.get("/api/proposals/{split}/{scenario_id}/{agent}")
-    def _proposals(split: str, scenario_id: str, agent: int) -> dict[str, Any]:
-        """Maneuvers of an agent."""
-        return session.proposals(split, scenario_id, agent)
 
     @app.get("/api/imported/{name}/{split}/{scenario_id}")
     def _imported(name: str, split: str, scenario_id: str) -> Response:

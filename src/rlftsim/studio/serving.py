@@ -5,7 +5,6 @@ import json
 import logging
 import os
 import socket
-import sys
 import threading
 import time
 import webbrowser
@@ -156,15 +155,10 @@ def _bind(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port must lie between 0 and 65535, got {port}: 0 takes a free one.")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    bound = socket.socket(family, socket.SOCK_STREAM)
-    if sys.platform != "win32":
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        bound.bind((host, port))
-        bound.listen(128)
+        return socket.create_server((host, port), family=family, backlog=128)
     except OSError as error:
-        bound.close()
         # A taken or forbidden port; everything else is the host's fault, as a name that stands for no address.
         advice = "choose another --port, or 0 for a free one" if error.errno in PORT_ERRORS else "choose another --host"
-        raise ConfigError(f"cannot listen on {host}:{port} ({error.strerror or error}): {advice}.") from None
-    return bound
+        cause = (error.strerror or str(error)).partition(" (while ")[0]
+        raise ConfigError(f"cannot listen on {host}:{port} ({cause}): {advice}.") from None

@@ -82,13 +82,3 @@ def free_variant(variants: tuple[Variant, ...], index: int) -> int:
     """
     model = variants[index].model
     return next(i for i, variant in enumerate(variants) if variant.model == model and not variant.goals)
-
-
-def has_goals(variants: tuple[Variant, ...], index: int) -> bool:
-    """True if the variant's model is simulated with goals, too.
-
-    Args:
-        variants: All variants of a run.
-        index: Index of a variant in the run.
-    """
-    return any(variant.goals and variant.model == variants[index].model for variant in variants)

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
-from rlftsim.evaluation.wire_format import BYTES, read_fields
+from rlftsim.evaluation.wire_format import BYTES, iterate_fields
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.realism import SIM_AGENTS, Challenge
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -168,7 +168,7 @@ class _Pass:
         self.check.shards.append(member.name)
         self.check.raw_bytes += member.size
         metadata = bytearray()
-        for wire_field in read_fields(contents, member.size):
+        for wire_field in iterate_fields(contents, 0, member.size, is_stream=True):
             if (wire_field.number, wire_field.wire_type) == (1, BYTES):
                 self._read_scenario(wire_field.payload, member.name)
             else:

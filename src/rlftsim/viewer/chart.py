@@ -149,6 +149,19 @@ def nice_ticks(low: float, high: float, count: int) -> list[float]:
     return [i * step for i in range(first, last + 1)]
 
 
+def label_ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
+    """Round numbers in [low, high] with their labels.
+
+    Args:
+        low: Lower limit of the axis.
+        high: Upper limit, above the lower limit.
+        count: Number of ticks to aim at.
+    """
+    ticks = nice_ticks(low, high, count)
+    step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
+    return [(tick, format_tick(tick, step)) for tick in ticks]
+
+
 def format_tick(value: float, step: float) -> str:
     """Number with as many digits as the distance between ticks needs, in powers of ten where there would be too many.
 
@@ -218,10 +231,8 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
         shapes.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
         shapes.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
     # 2. Ticks below the horizontal axis.
-    ticks = nice_ticks(axes.x_low, axes.x_high, 5)
-    for value in ticks:
+    for value, label in label_ticks(axes.x_low, axes.x_high, 5):
         x = float(axes.horizontal(np.array(value)))
-        label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
         shapes.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
         shapes.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
     shapes.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
@@ -238,9 +249,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
 def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
     """Values to mark on the vertical axis, with labels."""
     if not axes.log_y:
-        ticks = nice_ticks(axes.y_low, axes.y_high, 5)
-        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
-        return [(v, format_tick(v, step)) for v in ticks]
+        return label_ticks(axes.y_low, axes.y_high, 5)
     # Powers of ten, at most about five of them; over less than two decades also their double and fivefold.
     decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
     multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)

@@ -1,6 +1,6 @@
 """Figures as PNG or SVG: curves with bands, intervals beside each other, verdicts in a matrix, charts of pages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -85,42 +85,32 @@ def draw_bands(
     return figure
 
 
-@dataclass(frozen=True)
-class Subplot:
-    """Curves in a panel that shares both axes with neighboring panels."""
-
-    title: str
-    bands: tuple[Band, ...]
-
-
 def draw_subplots(
-    panels: Sequence[Subplot],
+    panels: Mapping[str, Sequence[Band]],
     *,
     title: str,
     x_label: str,
     y_label: str,
     ticks: Sequence[str],
-    columns: int,
     is_joined: bool = True,
 ) -> Figure:
-    """Figure of panels with percentages that share both axes and a legend.
+    """Figure of panels with percentages that share both axes and a legend, two in a row.
 
     Args:
-        panels: Curves with the same names in each panel; the horizontal axis counts ticks from 0.
+        panels: Curves by title, with the same names in each panel; the horizontal axis counts ticks from 0.
         title: Title above all panels.
         x_label: Quantity and unit of the horizontal axes.
         y_label: Quantity and unit of the vertical axes, 0 to 100 %.
         ticks: Names of the positions 0, 1, ... on the horizontal axis.
-        columns: Number of panels in a row.
         is_joined: True joins the dots of a curve, where the ticks have an order.
     """
-    rows = -(-len(panels) // columns)  # rounded up
+    columns, rows = 2, -(-len(panels) // 2)  # rounded up
     figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.8), layout="constrained")
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
-    for axis, panel in zip(axes, panels):
-        axis.set_title(panel.title, fontsize=10, loc="left", color=INK)
-        for band in panel.bands:
+    for axis, (heading, bands) in zip(axes, panels.items()):
+        axis.set_title(heading, fontsize=10, loc="left", color=INK)
+        for band in bands:
             color, is_theory = COLORS[band.color % len(COLORS)], band.style == "theory"
             line = ("--" if is_theory else "-") if is_joined else ""
             face = "white" if is_theory else color  # open dots for a theory

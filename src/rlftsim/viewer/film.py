@@ -18,7 +18,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.jobs.files import write_atomically
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.viewer.page import Animation, Panel
-from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots
+from rlftsim.viewer.picture import draw_agents, draw_scene, light_dots
 
 STEPS_PER_SECOND = 10
 HOLD_AT_END_S = 1.0
@@ -42,9 +42,7 @@ def to_film(
         DataError: The file cannot be written.
     """
     path = Path(path)
-    write = WRITERS.get(path.suffix.lower())
-    if write is None:
-        raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
+    write = find_writer(path)
     # The last frame stays for a while, or the end could not be seen before a player starts again.
     camera, rate = Camera(animation, dots_per_inch), STEPS_PER_SECOND / steps_per_frame
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
@@ -86,10 +84,7 @@ class Camera:
         scene, lights_at = self.animation.scene, step if light_step is None else light_step
         self._canvas.restore_region(self._ground)
         for axis, panel in zip(self._axes, panels):
-            shapes = agent_shapes(scene.agents, panel, step)
-            for shape in shapes:
-                axis.add_collection(shape, autolim=False)
-            artists: list[Artist] = [*shapes, light_dots(axis, scene, lights_at)]
+            artists: list[Artist] = [*draw_agents(axis, scene.agents, panel, step), light_dots(axis, scene, lights_at)]
             if panel.notes:
                 corner = {"transform": axis.transAxes, "va": "top", "bbox": {"color": "white", "alpha": 0.7, "pad": 2}}
                 note = panel.notes[min(step, len(panel.notes) - 1)]  # its episode may have ended before others
@@ -128,3 +123,15 @@ WRITERS: dict[str, Callable[[Path, Iterable[Frame], float], None]] = {
     ".gif": partial(_write_pictures, format="GIF"),
 }
 """Function that writes a film, by the ending of the file."""
+
+
+def find_writer(path: Path) -> Callable[[Path, Iterable[Frame], float], None]:
+    """Function that writes a film of the ending.
+
+    Raises:
+        ConfigError: An ending that is no film's.
+    """
+    write = WRITERS.get(path.suffix.lower())
+    if write is None:
+        raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
+    return write

@@ -19,7 +19,7 @@ from rlftsim.goals.attainment import NEAR_M
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.viewer.figure import DOTS_PER_INCH, INK, save_figure
 from rlftsim.viewer.page import Panel
-from rlftsim.viewer.picture import POINTS_PER_INCH, agent_shapes, draw_map, light_dots, write_notes
+from rlftsim.viewer.picture import draw_agents, draw_map, light_dots, write_notes
 from rlftsim.viewer.scene import SceneView, build_scene, logged_trajectories
 
 PANEL_INCHES = 4.2
@@ -92,14 +92,10 @@ def draw_goals(
     for axis, panel, scene in zip(axes, panels, scenes):
         log = logged_trajectories(panel.scenario)
         # 1. The map around the goals, with the agents at the current step.
-        x, y, radius = _focus(panel, scene)
         axis.set_axis_on()
-        axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
-        axis.set_facecolor("#eef0ec")
         axis.set_title(panel.title, fontsize=8, loc="left", color=INK)
-        draw_map(axis, scene, points_per_m=panel_inches * POINTS_PER_INCH / (2 * radius))
-        for shape in agent_shapes(scene.agents, Panel(panel.title, log), CURRENT_STEP):
-            axis.add_collection(shape, autolim=False)
+        draw_map(axis, scene, _focus(panel, scene), inches=panel_inches)
+        draw_agents(axis, scene.agents, Panel(panel.title, log), CURRENT_STEP)
         light_dots(axis, scene, CURRENT_STEP)
         # 2. Object ids of all agents, as goals files name them.
         for agent in np.flatnonzero(log.valid[0, :, CURRENT_STEP]):

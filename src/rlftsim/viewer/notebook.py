@@ -16,9 +16,9 @@ from rlftsim.jobs.files import write_text
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.open import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, register_html
-from rlftsim.viewer.film import WRITERS, to_film
-from rlftsim.viewer.page import Animation, Panel, animation_html, page_html, read_asset
-from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
+from rlftsim.viewer.film import WRITERS, find_writer, to_film
+from rlftsim.viewer.page import Animation, animate, animation_html, page_html, read_asset
+from rlftsim.viewer.scene import rollout_trajectories
 
 MAX_ROLLOUTS = 4
 """Rollouts that play in one panel: a notebook stores the page in its file, and every rollout adds about 50 kB."""
@@ -137,8 +137,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
         for simulated in rollouts:
             if simulated.valid is not None and simulated.provenance is not None:  # with the agents that enter
                 log = simulated.provenance.scenarios[simulated.find_row(log.scenario_id)]
-        scene = build_scene(log)
-        panels = [Panel("logged", logged_trajectories(log).with_overlaps(scene.agents))]
+        motions = []
         for name, simulated in zip(names, rollouts):
             if simulated.provenance is None and len(simulated.position) != len(scenarios):
                 raise ConfigError(
@@ -147,9 +146,8 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
                 )
             # By id where the rollouts know their scenarios, else by position.
             batch_row = row if simulated.provenance is None else simulated.find_row(log.scenario_id)
-            motion = rollout_trajectories(log, simulated, row=batch_row, max_rollouts=MAX_ROLLOUTS)
-            panels.append(Panel(name, motion.with_overlaps(scene.agents)))
-        animations.append(Animation(f"Scenario {log.scenario_id}", scene, panels))
+            motions.append((name, rollout_trajectories(log, simulated, row=batch_row, max_rollouts=MAX_ROLLOUTS)))
+        animations.append(animate(log, motions))
     figures = "\n".join(map(animation_html, animations))
     # panels are low enough for the frame, and the controls stay inside, whatever the width of the cell
     page = page_html(f"Scenario {scenarios[0].scenario_id}", figures, extra_css=read_asset("frame.css"))
@@ -176,8 +174,7 @@ def film(
         DataError: What `show` refuses, or a file that cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in WRITERS:
-        raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
+    find_writer(path)
     arguments = [rollouts] if isinstance(rollouts, Rollouts) else rollouts
     show(scenario, *arguments, titles=titles).save(path)
     return path

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -12,7 +12,8 @@ from typing import Any
 
 from rlftsim.errors import DataError
 from rlftsim.jobs.files import write_text
-from rlftsim.viewer.scene import SceneMotion, SceneView
+from rlftsim.scenario.types import Scenario
+from rlftsim.viewer.scene import SceneMotion, SceneView, build_scene, logged_trajectories
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,20 @@ class Animation:
         return {"scene": self.scene.to_payload(), "panels": panels}
 
 
+def animate(scenario: Scenario, motions: Iterable[tuple[str, SceneMotion]], *, caption: str = "") -> Animation:
+    """The log, and motions of the same agents beside it; agents that overlap are marked.
+
+    Args:
+        scenario: Scenario with the map and log that are drawn.
+        motions: Title and motion of each further panel.
+        caption: Text below the title.
+    """
+    scene = build_scene(scenario)
+    all_motions = [("logged", logged_trajectories(scenario)), *motions]
+    panels = [Panel(title, motion.with_overlaps(scene.agents)) for title, motion in all_motions]
+    return Animation(f"Scenario {scenario.scenario_id}", scene, panels, caption)
+
+
 def animation_html(animation: Animation) -> str:
     """A `<figure>` that plays the animation on a page made by `page_html`."""
     titles = [escape(panel.title) for panel in animation.panels]
@@ -99,6 +114,35 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>\n{read_asset('palette.css')}{read_asset('page.css')}{extra_css}</style>"
         f"</head>\n<body><main>\n{body}\n</main>\n<script>\n{script}{extra_js}</script></body></html>\n"
+    )
+
+
+def table_html(headings: Iterable[str], rows: Iterable[str], *, is_long: bool = False) -> str:
+    """A table of results that scrolls sideways.
+
+    Args:
+        headings: HTML of the headings of the columns.
+        rows: Elements `<tr>` of the body.
+        is_long: True limits the height, for tables of many rows.
+    """
+    head = "".join(f'<th scope="col">{heading}</th>' for heading in headings)
+    table = f'<table class="results"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
+    return f'<div class="card scroll{" long" if is_long else ""}" tabindex="0">{table}</div>'
+
+
+def tile_html(title: str, value: str, note: str = "", tone: str = "") -> str:
+    """A card with a large number.
+
+    Args:
+        title: Text above the number.
+        value: Number, plain text.
+        note: Text below the number, such as its interval; empty = none.
+        tone: "good" or "bad" for a color; empty = none.
+    """
+    below = f'<div class="interval">{note}</div>' if note else ""
+    return (
+        f'<div class="card tile {tone}"><div class="what">{escape(title)}</div>'
+        f'<div class="value">{value}</div>{below}</div>'
     )
 
 

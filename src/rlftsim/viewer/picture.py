@@ -64,8 +64,7 @@ def to_png(path: str | os.PathLike[str], animation: Animation, *, dots_per_inch:
     for axis, panel in zip(axes, animation.panels):
         draw_paths(axis, animation.scene.agents, panel)
         light_dots(axis, animation.scene, CURRENT_STEP)
-        for shape in agent_shapes(animation.scene.agents, panel, CURRENT_STEP):
-            axis.add_collection(shape, autolim=False)
+        draw_agents(axis, animation.scene.agents, panel, CURRENT_STEP)
     save_figure(Path(path), figure, dots_per_inch=dots_per_inch)
 
 
@@ -75,12 +74,9 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
     figure = Figure(figsize=(PANEL_INCHES * len(panels), PANEL_INCHES + 0.7), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, panel in zip(axes, panels):
-        x, y, radius = animation.scene.focus
-        axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
-        axis.set_facecolor(COLORS["ground"])
         axis.set_title(panel.title, fontsize=12, loc="left", fontweight="bold")
         axis.spines[:].set_visible(False)
-        draw_map(axis, animation.scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
+        draw_map(axis, animation.scene, animation.scene.focus, inches=PANEL_INCHES)
     names = {"ego": "ego", "evaluated": "evaluated agents", "other": "other agents"}
     handles = [Line2D([], [], color=COLORS[role], lw=5, label=label) for role, label in names.items()]
     marks = {"collides": "collides", "offroad": "off road"}
@@ -111,14 +107,19 @@ def write_notes(figure: Figure, scenes: Sequence[SceneView], *, panels_across: i
         figure.suptitle(lines, fontsize=7, color=COLORS["edge"], x=0.01, ha="left")
 
 
-def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
-    """Draw a scene's map: road, on it crosswalks, lines, and edges on top.
+def draw_map(axis: Axes, scene: SceneView, focus: tuple[float, float, float], *, inches: float) -> None:
+    """Draw a square of a scene's map: road, on it crosswalks, lines, and edges on top.
 
     Args:
-        axis: Axes in the map frame, meters.
+        axis: Axes that show the square, in the map frame, meters.
         scene: Still part of a scenario, with the map features as styled lines.
-        points_per_m: Points (1/72 inch) on paper for a meter, so that lanes have the width of the real road.
+        focus: Center x, y and half of the width of the square, meters.
+        inches: Width of the axes on paper, so that lanes have the width of the real road.
     """
+    x, y, radius = focus
+    axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
+    axis.set_facecolor(COLORS["ground"])
+    points_per_m = inches * POINTS_PER_INCH / (2 * radius)
     # Autoscaling is off for every collection: the limits show the focus of the scene, not the whole map.
     by_style: dict[str, list[np.ndarray]] = {}
     for line in scene.lines:
@@ -158,12 +159,13 @@ def draw_paths(axis: Axes, agents: AgentBoxes, panel: Panel) -> None:
         axis.add_collection(LineCollection(list(points), colors=color, lw=width, alpha=alpha), autolim=False)
 
 
-def agent_shapes(agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollection]:
-    """Shapes of the agents of a panel's first rollout, to be added to axes in the map frame.
+def draw_agents(axis: Axes, agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollection]:
+    """Draw the agents of a panel's first rollout; returns the shapes, which a film removes again.
 
     Boxes have a wedge that points ahead, pedestrians are discs; agents that collide or are off the road get a frame.
 
     Args:
+        axis: Axes in the map frame, meters.
         agents: Boxes of the scene, sizes in meters.
         panel: Motion of the agents; the first rollout counts.
         step: Step 0..90; beyond the end of the motion there are no shapes.
@@ -194,6 +196,8 @@ def agent_shapes(agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollec
         shapes.append(
             PolyCollection(frames, facecolor="none", edgecolor=COLORS[mark], lw=MARK_WIDTH, ls=style, zorder=4)
         )
+    for shape in shapes:
+        axis.add_collection(shape, autolim=False)
     return shapes
 
 

@@ -338,6 +338,23 @@ def rollout_trajectories(
     is_there = np.isfinite(future_position).all(-1) & np.isfinite(future_heading)
     if rollouts.valid is not None:
         is_there &= rollouts.valid[row, :max_rollouts, :num_agents].cpu().numpy()
+    return continue_log(scenario, future_position, future_heading, is_there)
+
+
+def continue_log(
+    scenario: Scenario,
+    position: Float[np.ndarray, "N A T 2"],
+    heading: Float[np.ndarray, "N A T"],
+    valid: Bool[np.ndarray, "N A T"],
+) -> SceneMotion:
+    """Simulated futures after the logged history.
+
+    Args:
+        scenario: Scenario that was simulated, with A simulated agents.
+        position: Positions [N, A, T, 2] after the current step, map frame, meters.
+        heading: Headings [N, A, T], radians.
+        valid: Mask [N, A, T]; False = the agent is absent.
+    """
     log = logged_trajectories(scenario)
 
     def join(past: np.ndarray, future: np.ndarray) -> np.ndarray:  # along the axis of steps
@@ -345,11 +362,7 @@ def rollout_trajectories(
         repeated = np.repeat(past[:, :, :HISTORY_STEPS], len(future), axis=0)
         return np.concatenate([repeated, future], axis=2)
 
-    return SceneMotion(
-        position=join(log.position, future_position),
-        heading=join(log.heading, future_heading),
-        valid=join(log.valid, is_there),
-    )
+    return SceneMotion(join(log.position, position), join(log.heading, heading), join(log.valid, valid))
 
 
 def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOLERANCE_M) -> Float[np.ndarray, "m 2"]:

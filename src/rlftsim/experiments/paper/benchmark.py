@@ -9,10 +9,9 @@ from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.compare import paired_values
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.model_specs import BASE, CATK, CONSTANT_VELOCITY, ORACLE, ROAD, FineTuned, over_seeds
-from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import RMM, Row, build_table, draw_gains, to_numbers
+from rlftsim.experiments.tables import RMM, Row, build_table, draw_gains, load_published, to_numbers
 
 REFERENCE, TUNED, CEILING, FLOOR = "base", "RLFTSim (MLOO)", "oracle", "constant velocity"
 IMITATIONS = {"CAT-K": CATK, "RoaD": ROAD}
@@ -40,7 +39,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     closed = {row.name: compute_gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
     return ExperimentResult(
         title="Benchmark: realism of the base model, closed-loop imitation and RLFTSim",
-        tables=(build_table("Ours", rows.values(), SCORES), published.load_table("benchmark")),
+        tables=(build_table("Ours", rows.values(), SCORES), load_published("benchmark")),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
             *(v for row in imitations for v in (row.against(base), row.seeds_against(base), tuned.against(row))),

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from rlftsim.evaluation.columns import format_estimate
 from rlftsim.evaluation.goal_attainment import Attained, attain_goals
 from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.experiments.model_specs import BASE, ModelSpec
@@ -15,7 +16,7 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.statistics import MeanInterval, mean_interval
-from rlftsim.viewer.figure import Band, Subplot, draw_subplots
+from rlftsim.viewer.figure import Band, draw_subplots
 
 RATES = {"passed": "passed [%]", "reached": "reached [%]"}
 """Fractions of the rollouts of a goal (attributes of `Attained`), and their headings."""
@@ -102,10 +103,7 @@ def build_rate_table(title: str, curves: Curves, unit: str = "") -> TextTable:
 
 def format_rate(rate: MeanInterval) -> str:
     """Mean rate in percent with standard error; a dash without a single rate."""
-    if not rate.count:
-        return "–"
-    error = f" ± {100 * rate.standard_error:.1f}" if rate.count > 1 else ""
-    return f"{100 * rate.mean:.1f}{error}"
+    return format_estimate(rate, lambda value: f"{100 * value:.1f}")
 
 
 def format_verdict(start_rates: Mapping[str, float], rates: Mapping[str, float]) -> str:
@@ -137,11 +135,9 @@ def draw_rates(
         ticks: Names of the positions on the horizontal axis.
         is_joined: True joins the dots of a curve, where the ticks have an order.
     """
-    subplots = [Subplot(heading, _build_bands(curves)) for heading, curves in panels.items()]
+    bands = {heading: _build_bands(curves) for heading, curves in panels.items()}
     y_label = "rollouts [%], 95 % interval"
-    return draw_subplots(
-        subplots, title=title, x_label=x_label, y_label=y_label, ticks=ticks, columns=2, is_joined=is_joined
-    )
+    return draw_subplots(bands, title=title, x_label=x_label, y_label=y_label, ticks=ticks, is_joined=is_joined)
 
 
 def _build_bands(curves: Curves) -> tuple[Band, ...]:

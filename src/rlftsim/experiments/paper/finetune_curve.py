@@ -5,10 +5,9 @@ from dataclasses import replace
 
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.experiments.model_specs import BASE, CATK, WEAK_EPOCHS, Base, FineTuned, ModelSpec, over_seeds
-from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import RMM, Row, build_gain_band, build_table, to_numbers
+from rlftsim.experiments.tables import RMM, Row, build_gain_band, build_table, load_published, to_numbers
 from rlftsim.viewer.figure import draw_bands
 
 EPOCHS_FRACTIONS = (0.25, 0.5, 1.0, 1.5)
@@ -84,7 +83,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         verdicts += [rows[point(second, length)].against(rows[point(first, length)]) for length in epochs]
     return ExperimentResult(
         title="Realism against epochs of fine-tuning",
-        tables=(build_table("Ours", rows.values(), SCORES[:4]), published.load_table("finetune-curve")),
+        tables=(build_table("Ours", rows.values(), SCORES[:4]), load_published("finetune-curve")),
         verdicts=tuple(verdicts),
         notes=(
             "At equal epochs all curves had the same number of updates of as many scenarios; RLFTSim simulates "

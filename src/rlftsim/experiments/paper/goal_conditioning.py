@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 from rlftsim.evaluation.columns import GOAL_COLUMNS
 from rlftsim.experiments.model_specs import GCFT, GCSL, FineTuned, GoalRewardType, GoalTraining, Guided, over_seeds
-from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import RMM, Row, build_table, to_numbers
+from rlftsim.experiments.tables import RMM, Row, build_table, load_published, to_numbers
 from rlftsim.viewer.figure import Interval, draw_intervals
 
 MISS = "passing_miss_rate"
@@ -91,7 +90,7 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
         tables=(
             build_table("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
             build_table("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
-            published.load_table("goal-conditioning"),
+            load_published("goal-conditioning"),
         ),
         verdicts=(
             *(_format_misses(start, row) for row in conditioned),

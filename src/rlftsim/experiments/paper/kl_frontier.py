@@ -6,11 +6,11 @@ from dataclasses import replace
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, SCORES
 from rlftsim.evaluation.compare import compare
 from rlftsim.experiments.model_specs import BASE, FineTuned, over_seeds
-from rlftsim.experiments.paper import paired_ttest, published, reward_ablation
+from rlftsim.experiments.paper import paired_ttest, reward_ablation
 from rlftsim.experiments.paper.reward_ablation import MLOO, REFERENCE
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import RMM, Row, build_gain_band, build_table, mean_of_seeds, to_numbers
+from rlftsim.experiments.tables import RMM, Row, build_gain_band, build_table, load_published, mean_of_seeds, to_numbers
 from rlftsim.viewer.figure import draw_bands
 
 FRACTIONS = (0.25, 0.5, 1.0)
@@ -79,7 +79,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             build_table(f"At a KL of {kl:.4f} nats a decision", (base, *equal.values()), COLUMNS),
             replace(matrix.tables[0], title="Row against column, at that KL"),
             build_table("Measured", (base, *measured), COLUMNS),
-            published.load_table("rewards"),
+            load_published("rewards"),
         ),
         verdicts=(_format_order(equal, kl), *(row.against(base) for row in equal.values()), *matrix.verdicts),
         notes=(

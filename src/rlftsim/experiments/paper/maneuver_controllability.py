@@ -1,29 +1,38 @@
-"""Maneuvers as goals of the ego: the logged maneuver, an alternative that the lanes allow, or either."""
+"""Maneuvers as goals of the ego: the logged maneuver, an alternative that the lanes allow, or either.
+
+The goals are in an editable file: logged and alternative maneuvers of egos that have both.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from rlftsim.errors import DataError
 from rlftsim.evaluation.goal_attainment import Attained
-from rlftsim.experiments.paper import controllability, published
+from rlftsim.experiments.goal_proposals import LOGGED, propose, split_label, to_goal_entry
+from rlftsim.experiments.paper import controllability
 from rlftsim.experiments.paper.controllability import RATES, ROWS, Attainment, Curves, estimate_mean, format_rate
 from rlftsim.experiments.paper.goal_conditioning import GUIDED, START
-from rlftsim.experiments.paper.maneuver_goals import NAME, find_goals, is_logged, parse_maneuver
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import TextTable
-from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
+from rlftsim.experiments.tables import TextTable, load_published
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
+from rlftsim.goals.placement import find_track
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, Maneuver
 from rlftsim.statistics import MeanInterval
 
+NAME = "maneuver-controllability"
 GOAL_RATES = {"passed_once": "goals passed in some rollout [%]", "reached_once": "goals reached in some rollout [%]"}
 """Fractions of the goals (attributes of `Attained`), and their headings. The paper does not say how it counts
 several rollouts of a goal; its percentages are those of whole goals."""
-LOGGED, MIXED, ALTERNATIVE = "ground truth", "mixed", "alternative only"
+GROUND_TRUTH, MIXED, ALTERNATIVE = "ground truth", "mixed", "alternative only"
 IN_CONDITION: Mapping[str, Callable[[Attained], bool]] = {
-    LOGGED: lambda outcome: is_logged(outcome.entry),
+    GROUND_TRUTH: lambda outcome: is_logged(outcome.entry),
     ALTERNATIVE: lambda outcome: not is_logged(outcome.entry),
 }
 """Tests of a goal being in a condition."""
-CONDITIONS = (LOGGED, MIXED, ALTERNATIVE)
+CONDITIONS = (GROUND_TRUTH, MIXED, ALTERNATIVE)
 """Mixed: the mean of a scenario's logged and its alternative goals."""
 MANEUVERS = [maneuver.value for maneuver in BENCHMARK_MANEUVERS]
 
@@ -80,7 +89,7 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
                 _tabulate_maneuvers(condition, *(by_maneuver[rate, condition] for rate in RATES))
                 for condition in IN_CONDITION
             ),
-            published.load_table("maneuvers"),
+            load_published("maneuvers"),
         ),
         verdicts=tuple(_format_gain(attained, row, rate) for rate in (*RATES, "passed_once") for row in GUIDED),
         notes=(
@@ -149,6 +158,80 @@ def _to_numbers(rates: Any) -> dict[str, Any]:
     if isinstance(rates, MeanInterval):
         return {name: getattr(rates, name) for name in ("mean", "standard_error", "interval", "count")}
     return {name: _to_numbers(branch) for name, branch in rates.items()}
+
+
+def goals_path(suite: ExperimentSuite) -> Path:
+    """Path of a suite's goals file, which may be edited by hand."""
+    return suite.out / f"{NAME}.goals.json"
+
+
+def propose_goals(dataset: ScenarioDataset, scenario_ids: Sequence[str]) -> GoalsFile:
+    """Logged and alternative maneuvers of every ego that has both. The logged maneuvers are the file's goals.
+
+    Args:
+        dataset: Scenarios with logged futures.
+        scenario_ids: Ids of the scenarios to propose goals for, in the order of the file.
+    """
+    logged, alternatives = [], []
+    for scenario_id in scenario_ids:
+        scenario = dataset.by_id(scenario_id)
+        proposals = propose(scenario, scenario.ego_index)
+        # An ego without an alternative, or whose logged maneuver has no name, cannot be compared with itself.
+        if {proposal.is_logged for proposal in proposals} == {True, False}:
+            for proposal in proposals:
+                (logged if proposal.is_logged else alternatives).append(to_goal_entry(scenario, proposal))
+    return GoalsFile(tuple(logged), tuple(alternatives))
+
+
+def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
+    """Goals of the suite's held-out scenarios from the suite's goals file, which is written first if there is none.
+
+    Raises:
+        DataError: No ego has two maneuvers, or the file was edited and makes no sense.
+    """
+    dataset, ids = controllability.open_held_out(suite)
+    path = goals_path(suite)
+    # 1. Goals are proposed once: the file may have been edited since.
+    if not path.exists():
+        write_goals(path, propose_goals(dataset, ids))
+    file = read_goals(path)
+    goals = [goal for goal in (*file.goals, *file.alternatives) if goal.scenario_id in ids]
+    # 2. All of them are checked, before anything is trained.
+    for goal in goals:
+        parse_maneuver(goal)
+        scenario = dataset.by_id(goal.scenario_id)
+        if find_track(goal, scenario) != scenario.ego_index:
+            raise DataError(
+                f"{goal}: agent {goal.agent_id} is not the ego of scenario {scenario.scenario_id}, and only the ego "
+                f"may have a goal here: write agent {scenario.tracks.object_id[scenario.ego_index]}, or remove the "
+                "entry."
+            )
+    if all(is_logged(goal) for goal in goals):
+        raise DataError(
+            f"{path}: not one ego of {len(ids)} scenarios has an alternative maneuver: take more scenarios."
+        )
+    return goals
+
+
+def is_logged(goal: GoalEntry) -> bool:
+    """True if the goal's maneuver is the logged maneuver."""
+    return split_label(goal.label)[1]
+
+
+def parse_maneuver(goal: GoalEntry) -> Maneuver:
+    """Maneuver that a goal's label names.
+
+    Raises:
+        DataError: The label names no maneuver.
+    """
+    try:
+        return Maneuver(split_label(goal.label)[0])
+    except ValueError:
+        maneuvers = ", ".join(m.value for m in BENCHMARK_MANEUVERS)
+        raise DataError(
+            f"{goal}: label {goal.label!r} names no maneuver: known are {maneuvers}, each with {LOGGED!r} if it "
+            "is the logged one."
+        ) from None
 
 
 EXPERIMENT = Experiment(

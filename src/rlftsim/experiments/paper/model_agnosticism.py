@@ -8,10 +8,9 @@ from rlftsim.errors import ConfigError
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.experiments.model_specs import BASE, CONSTANT_VELOCITY, FineTuned, ModelSpec, over_seeds
-from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import Row, build_table, draw_gains, to_numbers
+from rlftsim.experiments.tables import Row, build_table, draw_gains, load_published, to_numbers
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
 
@@ -73,7 +72,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     bases = [row for name, row in rows.items() if UNTUNED in name]
     return ExperimentResult(
         title="Model agnosticism: RLFTSim on two architectures",
-        tables=(build_table("Ours", rows.values(), SCORES), published.load_table("model-agnosticism")),
+        tables=(build_table("Ours", rows.values(), SCORES), load_published("model-agnosticism")),
         verdicts=(
             *(base.against(rows[FLOOR]) for base in bases),
             *(

@@ -7,13 +7,12 @@ bin all the probability.
 import math
 from collections.abc import Mapping
 
-from rlftsim.evaluation.columns import SCORES, format_number
+from rlftsim.evaluation.columns import SCORES, format_estimate, format_number
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.model_specs import ORACLE
-from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import RMM, Row, TextTable, build_table, to_numbers
+from rlftsim.experiments.tables import RMM, Row, TextTable, build_table, load_published, to_numbers
 from rlftsim.realism import FEATURE_NAMES, metric_by_name
 from rlftsim.statistics import MeanInterval
 from rlftsim.viewer.figure import Interval, draw_intervals
@@ -34,7 +33,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         tables=(
             build_feature_table(features, weights, row.mean),
             build_table("Ours, in all", [row], SCORES),
-            published.load_table("oracle"),
+            load_published("oracle"),
         ),
         verdicts=(
             f"The log itself scores {row.mean.mean_and_error(RMM).mean:.4f}: the most that a model can gain here is "
@@ -69,13 +68,9 @@ def build_feature_table(
     """
     rows = []
     for name, estimate in features.items():
-        likelihood, cost = "–", "–"
-        if math.isfinite(estimate.mean):
-            error = f" ± {estimate.standard_error:.4f}" if math.isfinite(estimate.standard_error) else ""
-            likelihood = f"{format_number(estimate.mean, 4)}{error}"
-            # Weights add up to 1, so the costs add up to what the meta-metric lacks to 1, if no feature is missing.
-            cost = format_number(weights[name] * (1 - estimate.mean), 4)
-        rows.append((name.replace("_", " "), f"{weights[name]:g}", likelihood, cost))
+        # Weights add up to 1, so the costs add up to what the meta-metric lacks to 1, if no feature is missing.
+        cost = format_number(weights[name] * (1 - estimate.mean)) if math.isfinite(estimate.mean) else "–"
+        rows.append((name.replace("_", " "), f"{weights[name]:g}", format_estimate(estimate), cost))
     note = f"{len(evaluation)} scenarios, metric {evaluation.config.metric}; mean ± standard error."
     headings = ("feature", "weight", "likelihood ↑", "missing to 1, weighted ↓")
     return TextTable("Ours, by feature", headings, tuple(rows), note)

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Int
 
 from rlftsim.evaluation.compare import compare
-from rlftsim.experiments.paper import published, reward_ablation
+from rlftsim.experiments.paper import reward_ablation
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import RMM, Row, TextTable
+from rlftsim.experiments.tables import RMM, Row, TextTable, load_published
 from rlftsim.viewer.figure import draw_verdicts
 
 ALPHA = 1e-3
@@ -44,7 +44,7 @@ def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> Experiment
     pairs = [(i, j) for i in range(len(names)) for j in range(i + 1, len(names))]
     return ExperimentResult(
         title="Paired t-test: every reward against every other",
-        tables=(TextTable("Ours", ("", *names), cells, note), published.load_table("paired-ttest")),
+        tables=(TextTable("Ours", ("", *names), cells, note), load_published("paired-ttest")),
         verdicts=tuple(f"{names[i]} against {names[j]}: {gains[i][j].verdict}" for i, j in pairs),
         notes=(
             suite.budget.note,

@@ -6,7 +6,6 @@ order, and the largest increase; of each, the rollout with the largest change.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -25,12 +24,8 @@ NUM_BEST = 3
 VERDICTS = {"Collisions": "collision_rate", "Off-road driving": "offroad_rate", "RMM": RMM}
 
 
-@dataclass(frozen=True, eq=False)
-class Pairs:
-    """Rows of both models, and the animations by rank in the order of scenarios, in words."""
-
-    rows: Mapping[str, Row]
-    animations: Mapping[str, PairedAnimation]
+Pairs = tuple[Mapping[str, Row], Mapping[str, PairedAnimation]]
+"""Rows of both models, and the animations by rank in the order of scenarios, in words."""
 
 
 def run(suite: ExperimentSuite) -> Pairs:
@@ -50,7 +45,7 @@ def run(suite: ExperimentSuite) -> Pairs:
         )
         for rank, scenario_id in choose_scenarios(list(ids), rates[0], rates[1]).items()
     }
-    return Pairs(rows, animations)
+    return rows, animations
 
 
 def choose_scenarios(
@@ -79,10 +74,11 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
         pairs: Rows and animations that `run` made; no rollout is simulated here.
         suite: Suite with the budget for the notes.
     """
-    base, tuned = (pairs.rows[name] for name in SPECS)
+    rows, animations = pairs
+    base, tuned = (rows[name] for name in SPECS)
     cells = tuple(
         (rank, pair.scenario_id, str(pair.rollout), *(f"{r:.2f}" for r in pair.rates), *map(str, pair.events))
-        for rank, pair in pairs.animations.items()
+        for rank, pair in animations.items()
     )
     headings = ("place", "scenario", "rollout", "rate before", "rate after", "events before", "events after")
     note = (
@@ -107,10 +103,10 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
             "rows": to_numbers([base, tuned], SCORES),
             "pairs": [
                 {name: getattr(pair, name) for name in ("scenario_id", "rollout", "rates", "events")}
-                for pair in pairs.animations.values()
+                for pair in animations.values()
             ],
         },
-        animations=tuple(pair.animation for pair in pairs.animations.values()),
+        animations=tuple(pair.animation for pair in animations.values()),
     )
 
 

@@ -6,10 +6,9 @@ import numpy as np
 
 from rlftsim.evaluation.columns import COLUMNS
 from rlftsim.experiments.model_specs import BASE, FineTuned, over_seeds
-from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import Row, TextTable, build_table, draw_gains, to_numbers
+from rlftsim.experiments.tables import Row, TextTable, build_table, draw_gains, load_published, to_numbers
 from rlftsim.training.run_folder import read_metrics
 
 REFERENCE, MLOO = "base", "MLOO"
@@ -59,8 +58,8 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         tables=(
             build_table("Ours", rows.values(), COLUMNS),
             *((distances,) if distances.rows else ()),
-            published.load_table("rewards"),
-            published.load_table("heuristics"),
+            load_published("rewards"),
+            load_published("heuristics"),
         ),
         verdicts=(
             *(row.against(base) for row in tuned),

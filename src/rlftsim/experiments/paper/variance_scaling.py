@@ -8,9 +8,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from rlftsim.evaluation.reward_variance import MIN_SIZES_FOR_A_SLOPE, REWARDS, Variances, measure_variances
+from rlftsim.experiments.model_specs import BASE
 from rlftsim.experiments.results import Experiment, ExperimentResult, TextTable
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.policies.registry import load_policy
 from rlftsim.statistics import MeanInterval, mean_interval
 from rlftsim.viewer.figure import Band, draw_bands
 
@@ -22,8 +22,7 @@ CLAIMED_SLOPE = {"mloo": -2.0, "rloo": 0.0}
 
 def run(suite: ExperimentSuite) -> Variances:
     """Variances of the base model's rewards, see `measure_variances`."""
-    policy = load_policy(suite.base(), suite.device)
-    return measure_variances(policy, suite.data, suite.out / "variances", suite.evaluation)
+    return measure_variances(suite.policy(BASE), suite.data, suite.out / "variances", suite.evaluation)
 
 
 def fit_slope(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
