@@ -127,13 +127,13 @@ def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[
         counts: Counts of N distinct rollouts.
         repeat: Number of identical rollouts behind each of the N.
     """
-    # Counts are whole numbers below 2^24: sums and differences are exact in float32.
-    totals = [values.sum(0, keepdim=True) * repeat for values in (counts.bins, counts.agreement)]
-    sets = replace(
-        counts,
-        bins=torch.cat([totals[0], totals[0] - counts.bins, counts.bins]),
-        agreement=torch.cat([totals[1], totals[1] - counts.agreement, counts.agreement]),
-    )
+
+    def form(values: Tensor) -> Tensor:
+        # Counts are whole numbers below 2^24: sums and differences are exact in float32.
+        total = values.sum(0, keepdim=True) * repeat
+        return torch.cat([total, total - values, values])
+
+    sets = replace(counts, bins=form(counts.bins), agreement=form(counts.agreement))
     size = counts.bins.new_ones(len(sets.bins))
     size[0] = len(counts.bins) * repeat
     size[1 : len(counts.bins) + 1] = len(counts.bins) * repeat - 1

@@ -244,8 +244,7 @@ class ShardReader:
         except (ValueError, TypeError, AttributeError, IndexError, DataError) as error:
             cause = error if isinstance(error, ValueError | DataError) else "it lacks an array, or there is no such row"
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
-        features = scenario.map_features
-        for group in (scenario, scenario.tracks, features, features.topology, scenario.lights):
+        for group in (scenario, *scenario.tables.values()):
             for value in vars(group).values():
                 if isinstance(value, np.ndarray):
                     value.flags.writeable = False
@@ -299,9 +298,7 @@ def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
     The codec uses that neighbors along the last axis are alike. So components of vectors are separate columns, and
     tables [rows, columns] are transposed, because the entries of a column resemble each other.
     """
-    features = scenario.map_features
-    groups = {"": scenario, "tracks": scenario.tracks, "map": features, "topology": features.topology}
-    groups["lights"] = scenario.lights
+    groups = {"": scenario, **scenario.tables}
     arrays: dict[str, np.ndarray | None] = {}
     for name, (_, *components) in _ARRAYS.items():
         group, _, attribute = name.rpartition(".")

@@ -315,9 +315,7 @@ class Scenario:
         Raises:
             DataError: A value is no array, or an axis has a different length than in the arrays before.
         """
-        features = self.map_features
-        tables = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
-        for name, table in tables.items():
+        for name, table in self.tables.items():
             _check_shapes(table, name)
 
     def check_consistency(self) -> None:
@@ -439,6 +437,12 @@ class Scenario:
             tracks=self.tracks.cut(steps),
             lights=LightStates(**observed | {"step": observed["step"] - observed["step"].dtype.type(start)}),
         )
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """Tables of arrays by the names that messages and shards give them."""
+        features = self.map_features
+        return {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
 
     @property
     def num_steps(self) -> int:

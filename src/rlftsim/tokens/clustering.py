@@ -29,7 +29,6 @@ from rlftsim.tokens.motions import (
     mirror_poses,
     motion_keys,
     sample_scenarios,
-    window_keys,
     with_mirror_images,
 )
 from rlftsim.tokens.trajtok import GridMotions, TrajTokConfig, rule_tokens
@@ -136,7 +135,8 @@ def _collect_motions(
                 sample.add(class_motions, motion_keys(class_motions))
                 grid.add(class_motions)
             map_windows = split_map(scenario).windows
-            windows.add(map_windows, window_keys(map_windows))
+            # windows that agree to 5 cm are the same
+            windows.add(map_windows, np.round(map_windows.reshape(len(map_windows), 22) / 0.05).astype(np.int64))
             advance()
     return samples, cells, windows
 

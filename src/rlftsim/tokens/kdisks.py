@@ -5,6 +5,7 @@ searched: the smallest at which V disks cover a given fraction. So a small vocab
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
@@ -49,12 +50,8 @@ class Cloud:
         return candidates[shape_distance(self.shapes[candidates], center) <= radius_m]
 
 
-@dataclass(frozen=True, eq=False)
-class Disk:
-    """Members of a disk. `is_pair` is True if the mirror image is a disk, too."""
-
-    members: Int64[np.ndarray, "m"]
-    is_pair: bool
+Disk: TypeAlias = tuple[Int64[np.ndarray, "_"], bool]
+"""Members of a disk, and True if the mirror image is a disk, too."""
 
 
 def shape_distance(shapes: Float32[np.ndarray, "n k 2"], center: Float32[np.ndarray, "*k 2"]) -> Float[np.ndarray, "n"]:
@@ -92,9 +89,9 @@ def cluster_motions(
     motions = with_mirror_images(motions) if mirror else motions
     disks, radius = cover_shapes(cloud, coverage=coverage, limit=limit, rng=rng)
     tokens = [_STILL]
-    for disk in disks[1:]:
-        token = mean_motion(motions[disk.members])[None]
-        if disk.is_pair:
+    for members, is_pair in disks[1:]:
+        token = mean_motion(motions[members])[None]
+        if is_pair:
             tokens += [token, mirror_poses(token)]
         else:
             # With mirror images, a disk that is not one of a pair is its own mirror image.
@@ -118,7 +115,7 @@ def cluster_windows(
         return straight[None]
     cloud = Cloud(windows, straight)
     disks, _ = cover_shapes(cloud, coverage=coverage, limit=limit, rng=rng)
-    return np.stack([straight, *[windows[disk.members].mean(0) for disk in disks[1:]]]).astype(np.float32)
+    return np.stack([straight, *[windows[members].mean(0) for members, _ in disks[1:]]]).astype(np.float32)
 
 
 def cover_shapes(cloud: Cloud, *, coverage: float, limit: int, rng: np.random.Generator) -> tuple[list[Disk], float]:
@@ -156,8 +153,8 @@ def lay_disks(
         limit: Greatest number of tokens; a pair of disks counts twice.
     """
     is_uncovered = np.ones(len(cloud.shapes), bool)
-    disks = [Disk(cloud.within(cloud.start, radius_m), is_pair=False)]
-    is_uncovered[disks[0].members] = False
+    disks = [(cloud.within(cloud.start, radius_m), False)]
+    is_uncovered[disks[0][0]] = False
     count = 1
     axis_distance = np.inf if cloud.straight is None else shape_distance(cloud.shapes, cloud.straight)
     is_pair = (axis_distance > radius_m) & (cloud.partner is not None) & np.ones(len(is_uncovered), bool)
@@ -174,7 +171,7 @@ def lay_disks(
         is_uncovered[members] = False
         if cloud.partner is not None:
             is_uncovered[cloud.partner[members]] = False
-        disks.append(Disk(members, bool(is_pair[index])))
+        disks.append((members, bool(is_pair[index])))
         count += num_tokens
     return disks, is_uncovered
 

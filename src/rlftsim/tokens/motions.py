@@ -120,11 +120,6 @@ def motion_keys(poses: Float32[np.ndarray, "n 6 3"]) -> Int64[np.ndarray, "n 6"]
     return np.where((key[rows, first] < mirror_key[rows, first])[:, None], mirror_key, key)
 
 
-def window_keys(windows: Float32[np.ndarray, "n 11 2"]) -> Int64[np.ndarray, "n 22"]:
-    """Keys that are equal for map windows that agree to 5 cm."""
-    return np.round(windows.reshape(len(windows), 22) / 0.05).astype(np.int64)
-
-
 def sample_scenarios(num_scenarios: int, limit: int | None, seed: int) -> list[int]:
     """Positions of at most `limit` scenarios, sampled uniformly, in ascending order.
 

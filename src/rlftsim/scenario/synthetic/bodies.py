@@ -148,13 +148,6 @@ def smooth_over_time(values: Float[np.ndarray, "n ..."], sigma_s: float) -> Floa
     return np.stack(smooth, axis=1).reshape(values.shape)
 
 
-def _central_differences(position: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Velocity in m/s; zero for a body of a single step."""
-    if len(position) < 2:
-        return np.zeros_like(position)
-    return np.gradient(position, STEP_S, axis=0)
-
-
 def build_vehicle(
     path: BumperPath,
     object_type: ObjectType,
@@ -183,7 +176,7 @@ def build_vehicle(
     # [n]: the path of the bumper alone decides the heading, which can neither jump nor slip
     heading = drag_rear_axle(bumper, size[0], path.direction[0])
     center = bumper - size[0] / 2 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    velocity = _central_differences(center)
+    velocity = np.gradient(center, STEP_S, axis=0)
     return Body(object_type, path.first_step, center, heading, velocity, size, is_evaluable=is_evaluable)
 
 
@@ -231,7 +224,7 @@ def build_pedestrian(
         size: Length, width and height in meters.
     """
     smooth = smooth_over_time(position, WALK_SMOOTHING_S)
-    velocity = _central_differences(smooth)
+    velocity = np.gradient(smooth, STEP_S, axis=0)
     walking = np.flatnonzero(np.linalg.norm(velocity, axis=1) > WALK_HEADING_SPEED_MPS)
     heading = np.full(len(position), heading_rad)
     if len(walking):

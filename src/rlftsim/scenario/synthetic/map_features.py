@@ -169,8 +169,6 @@ def split_ring(ring: Float[np.ndarray, "n 2"], is_selected: np.ndarray) -> list[
     """
     if is_selected.all():
         return [ring]
-    if not is_selected.any():
-        return []
     points, is_inside = ring[:-1], is_selected[:-1]
     # start at a point outside of all runs: then no run passes the seam
     start = int(np.flatnonzero(~is_inside)[0])
