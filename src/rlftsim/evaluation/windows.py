@@ -19,7 +19,6 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.resumable import check_same_work
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_name
-from rlftsim.jobs.items import group_positions
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.entries import identify_entries, load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -250,10 +249,10 @@ def evaluate_windows(
             scenario = scenarios[position] if entry_model is None else add_visitors(scenarios[position])
             batch = collate([scenario]).to(get_device(policy))
             logs.append(measure_windows(read_log(scenarios[position]).steps(slice(num_steps))))
-            for ids in group_positions(num_rollouts, rollouts_per_pass):
+            for first in range(0, num_rollouts, rollouts_per_pass):
                 simulated = simulate(
-                    policy, batch, num_rollouts=ids, seed=seed, num_steps=num_steps, sampling=sampling,
-                    entries=entry_model,
+                    policy, batch, num_rollouts=range(first, min(first + rollouts_per_pass, num_rollouts)), seed=seed,
+                    num_steps=num_steps, sampling=sampling, entries=entry_model,
                 )  # fmt: skip
                 rollouts += map(measure_windows, read_rollouts(scenario, simulated))
             advance()

@@ -5,13 +5,13 @@ this machine as its host (a foreign name that resolves to 127.0.0.1 is "DNS rebi
 where it changes something, the studio's own origin.
 """
 
-import json
 import secrets
 from dataclasses import dataclass, field
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers
 from starlette.requests import cookie_parser
+from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY_BYTES = 1 << 20
@@ -80,6 +80,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check a request, then call the application."""
+        send = self._with_headers(send)
         if scope["type"] == "lifespan":
             return await self.app(scope, receive, send)
         if scope["type"] != "http":  # no route is a WebSocket
@@ -88,20 +89,22 @@ class Guard:
         offered = parse_qs(scope["query_string"].decode("latin-1")).get("token", []) if scope["path"] == "/" else []
         refusal = self._find_refusal(scope, headers, offered)
         if refusal is not None:
-            return await self._answer(send, *refusal)
+            return await _build_refusal(*refusal)(scope, receive, send)
         if offered:
             # The address bar, the history and logs of proxies must not keep the token.
             cookie = f"{self.access.cookie}={self.access.token}; HttpOnly; SameSite=Strict; Path=/"
-            return await self._answer(send, 303, "", {"location": "./", "set-cookie": cookie})
+            answer = Response(status_code=303, headers={"location": "./", "set-cookie": cookie})
+            return await answer(scope, receive, send)
         body = b""
         while scope["method"] not in SAFE_METHODS:
             message = await receive()
             body += message.get("body", b"")
             if len(body) > MAX_BODY_BYTES:
-                return await self._answer(send, 413, f"the request is larger than {MAX_BODY_BYTES} bytes: send less.")
+                refusal = 413, f"the request is larger than {MAX_BODY_BYTES} bytes: send less."
+                return await _build_refusal(*refusal)(scope, receive, send)
             if not message.get("more_body"):
                 break
-        await self.app(scope, _replay(body, receive), self._with_headers(send))
+        await self.app(scope, _replay(body, receive), send)
 
     def _find_refusal(self, scope: Scope, headers: Headers, offered: list[str]) -> tuple[int, str] | None:
         """Status and sentence for a request that is not let through."""
@@ -123,15 +126,6 @@ class Guard:
                 return 415, "the body must be application/json."
         return None
 
-    async def _answer(
-        self, send: Send, status: int, sentence: str, extra_headers: dict[str, str] | None = None
-    ) -> None:
-        body = json.dumps({"error": sentence, "hint": ""}).encode() if sentence else b""
-        headers = {"content-type": "application/json", "content-length": str(len(body)), "cache-control": "no-store"}
-        pairs = [(name.encode(), value.encode()) for name, value in (headers | (extra_headers or {})).items()]
-        await send({"type": "http.response.start", "status": status, "headers": [*pairs, *self.access.headers]})
-        await send({"type": "http.response.body", "body": body})
-
     def _with_headers(self, send: Send) -> Send:
         async def send_on(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -141,6 +135,11 @@ class Guard:
             await send(message)
 
         return send_on
+
+
+def _build_refusal(status: int, sentence: str) -> Response:
+    """Answer to a request that is not let through, in the form of all errors."""
+    return JSONResponse({"error": sentence, "hint": ""}, status)
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
