@@ -19,7 +19,7 @@ from jaxtyping import Float32, Int, UInt8
 from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.rollout_files import AXES
-from rlftsim.evaluation.wire_format import BYTES, read_fields
+from rlftsim.evaluation.wire_format import BYTES, iterate_fields
 from rlftsim.realism import SCENARIO_GEN, SIM_AGENTS, Challenge, SimulatedStates
 
 NUM_SCENES = 32
@@ -161,15 +161,14 @@ def decode_rollouts(data: bytes) -> DecodedRollouts:
 def _decode_uniform(data: bytes, challenge: Challenge) -> DecodedRollouts | None:
     """Contents where all scenes have the layout that `encode_rollouts` gives to the first; None for any other."""
     try:
-        fields = read_fields(BytesIO(data), len(data))
+        fields = iterate_fields(BytesIO(data), 0, len(data), is_stream=True)
         name, scene = next(fields), next(fields)
         agents = submission_pb2.JointScene.FromString(scene.payload).simulated_trajectories
         if len(agents) * count_bytes(challenge) > len(scene.payload):  # too short for their numbers
             return None
         object_ids = tuple(agent.object_id for agent in agents)
         layout, starts = _lay_out_scene(object_ids, [agent.object_type for agent in agents], challenge)
-        offset = len(name.head) + len(name.payload)
-        rows = np.frombuffer(data, np.uint8, offset=offset).reshape(-1, layout.shape[1])  # [N, bytes]
+        rows = np.frombuffer(data, np.uint8, offset=name.stop).reshape(-1, layout.shape[1])  # [N, bytes]
     except (DataError, DecodeError, StopIteration, ValueError):
         return None
     is_header = layout[0] == layout[1]
