@@ -3,7 +3,6 @@ import math
 import shutil
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,6 +12,7 @@ import scenes
 import tiny
 from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.rollout.policy import Prediction
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
 from rlftsim.training.checkpoint import newest_checkpoint
@@ -189,8 +189,8 @@ def test_the_weight_of_standing_tokens_leaves_their_learned_probability_alone():
 
     def loss():
         optimizer.zero_grad()
-        dist = SimpleNamespace(logits=logits.expand(100, 3), target=target, target_mask=counts, class_id=class_id)
-        value = summed_loss(dist, 0.0, still_weight=0.15).loss
+        prediction = Prediction(logits.expand(100, 3), target, counts, class_id)
+        value = summed_loss(prediction, 0.0, still_weight=0.15).loss
         value.backward()
         return value
 

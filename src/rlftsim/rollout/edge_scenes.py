@@ -11,7 +11,6 @@ from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightStates, Map
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
 """53.13 degrees: sine 4/5 and cosine 3/5 are short fractions, so rotated grid points stay exact in float32."""
 GRID_M = 5 / 4096
-_NO_LIGHTS, _NO_MAP = LightStates.of([]), MapFeatures.of([])
 
 
 def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, float]) -> Scenario:
@@ -70,11 +69,12 @@ def place_on_grid(scenario: Scenario) -> Scenario:
 def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:
     """Edge cases made of a scenario, by name. All keep the ego."""
     ego_alone = _with_tracks(scenario, np.array([scenario.ego_index]))
+    no_lights, no_map = LightStates.of([]), MapFeatures.of([])
     return {
         "one agent": ego_alone,
-        "one agent, no map, no lights": replace(ego_alone, map_features=_NO_MAP, lights=_NO_LIGHTS),
-        "no map": replace(scenario, map_features=_NO_MAP, lights=_NO_LIGHTS),
-        "no lights": replace(scenario, lights=_NO_LIGHTS),
+        "one agent, no map, no lights": replace(ego_alone, map_features=no_map, lights=no_lights),
+        "no map": replace(scenario, map_features=no_map, lights=no_lights),
+        "no lights": replace(scenario, lights=no_lights),
         "128 agents": _crowded(scenario, 128),
         "agents first seen at the current step": _with_late_agents(scenario, CURRENT_STEP),
         "agents first seen at step 7": _with_late_agents(scenario, 7),

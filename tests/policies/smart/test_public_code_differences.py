@@ -4,7 +4,7 @@ The table is in docs/catk.md; other rows' tests stand elsewhere.
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -12,6 +12,7 @@ from test_properties import features, smart
 from torch import nn
 
 import scenes
+from rlftsim.rollout.policy import Prediction
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType
 from rlftsim.tokens.agent_tokens import tokenize_agents
@@ -93,14 +94,6 @@ def test_dropout_is_active_in_closest_among_top_k_of_a_policy_that_trains(vocabu
 # ---- losses --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Predicted:
-    logits: torch.Tensor
-    target: torch.Tensor
-    target_mask: torch.Tensor
-    class_id: torch.Tensor
-
-
 class Oracle(nn.Module):
     """Gives the right token a probability, the others the rest."""
 
@@ -114,7 +107,7 @@ class Oracle(nn.Module):
         logits = torch.full((7, NUM_TOKENS), math.log(others))
         target = torch.arange(7)
         logits[target, target] = math.log(self.probability)
-        return Predicted(
+        return Prediction(
             logits + self.shift, target, torch.ones(7, dtype=torch.bool), torch.zeros(7, dtype=torch.int64)
         )
 
