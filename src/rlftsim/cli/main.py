@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _print_error(message: str) -> None:
-    """Print one line: without control characters that a user's text may bring, and of a length that can be read."""
+    """Print a line without control characters of a user's text, and of a length that can be read."""
     print(f"rlftsim: {shorten(message)}", file=sys.stderr)
 
 
@@ -125,7 +125,7 @@ def parse(words: Sequence[str]) -> Any:
 
 
 def _in_words(error: Exception) -> str | None:
-    """One line about what the machine lacks; None for any other error."""
+    """Line about a lack of the machine; None for any other error."""
     # Libraries wrap a full disk in errors of their own, so the text decides, not the class.
     if getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error):
         filename = getattr(error, "filename", None)

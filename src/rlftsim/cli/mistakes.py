@@ -1,4 +1,4 @@
-"""Words of a command line that make no sense, explained in one line."""
+"""Words of a command line that make no sense, explained in a line."""
 
 import difflib
 import re
@@ -25,7 +25,7 @@ def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
 
 
 def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
-    """One line that says what is wrong with a command line.
+    """Line about a mistake in a command line.
 
     Args:
         words: Words behind the verb.
@@ -48,7 +48,7 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
 
 
 def nearest(flag: str, flags: Sequence[str]) -> str | None:
-    """The flag that a mistyped one most likely stands for; None = none is near.
+    """The flag nearest to a mistyped flag; None = all are far.
 
     Args:
         flag: Mistyped flag, such as "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".

@@ -1,4 +1,4 @@
-"""From the words of a command line to a verb with its settings."""
+"""From the words of a command line to a verb with settings."""
 
 import io
 import os
@@ -39,11 +39,11 @@ def parse(words: Sequence[str]) -> Call:
     """The call of a verb that a command line stands for.
 
     Args:
-        words: Verb, its action if it has some, and what follows.
+        words: Verb, action if any, and all further words.
 
     Raises:
-        ConfigError: The words make no sense; says which word and what it may have meant.
-        SystemExit: They ask for help, which has been printed.
+        ConfigError: The words make no sense; says which word, and a likely meaning.
+        SystemExit: Help was asked for, and has been printed.
     """
     # switches that may be left out get the value that tyro expects
     words = list(chain.from_iterable(["--goal-logit-bias", EITHER_OR[w]] if w in EITHER_OR else [w] for w in words))
@@ -74,7 +74,7 @@ def list_actions(verb: str) -> list[str]:
 
 
 def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
-    """Print the actions of a verb, or say that one is missing or unknown."""
+    """Print the actions of a verb, or say that the action is missing or unknown."""
     actions = list_actions(verb)
     if not any(word in HELP for word in words):
         raise ConfigError(explain_action(words, actions))
@@ -88,7 +88,7 @@ def _explain_actions(verb: str, words: Sequence[str]) -> NoReturn:
 
 
 def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
-    """The call of a command, or its help, or one line of complaint. Defaults are those of a recipe; None = guessed."""
+    """The call of a command, or the help, or a line of complaint. Defaults are those of a recipe; None = guessed."""
     command, flags, complete = COMMANDS[name], None, words
     if command.sections:
         # Imported late: most verbs do not need recipes.

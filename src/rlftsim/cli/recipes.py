@@ -1,4 +1,4 @@
-"""From the words of a command line to the settings of its recipe; imports torch."""
+"""From the words of a command line to the settings of a recipe; imports torch."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -40,7 +40,7 @@ class Call:
 
 
 def make_parser(command: Command, settings: Mapping[str, Any]) -> Callable[..., Call]:
-    """A function for tyro, which reads its signature; makes the call of a command line.
+    """A function with a signature for tyro; makes the call of a command line.
 
     Args:
         command: Command whose function and printer have the arguments.
@@ -104,7 +104,7 @@ class Argument:
 
 
 def read_arguments(function: Callable[..., Any]) -> dict[str, Argument]:
-    """Arguments of a function by name: types, defaults, and texts of the docstring, each on one line.
+    """Arguments of a function by name: types, defaults, and texts of the docstring, a line each.
 
     Args:
         function: Function whose docstring has a section `Args`.
@@ -162,7 +162,7 @@ def with_parameters(
 
 
 def list_flags(words: Sequence[str]) -> list[str]:
-    """Flags among words, without their values, as help texts write them."""
+    """Flags among words without values, as in help texts."""
     return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
 
 

@@ -1,6 +1,6 @@
 """Imports without the libraries that take seconds to load, for help texts.
 
-A help text needs the names, types and docstrings of settings, not torch. While it is made, slow libraries are
+A help text needs the names, types and docstrings of settings, not torch. Meanwhile slow libraries are
 replaced by stand-ins that accept whatever a module does with a library while it is imported: subclass,
 annotate, decorate, call. (Sphinx documents packages in the same way: `autodoc_mock_imports`.)
 """
@@ -29,7 +29,7 @@ SLOW = (
 
 
 class _StandIn:
-    """What stands for a class or a value: it has any attribute, and nothing inside."""
+    """Stands for a class or a value: any attribute, an empty sequence."""
 
     def __getattr__(self: Any, name: str) -> Any:
         if name.startswith("__"):
@@ -44,7 +44,7 @@ class _StandIn:
 
 
 class _AnyClass(_StandIn, type):
-    """Class of a stand-in: attributes and unions of it are stand-ins, too."""
+    """Class of a stand-in, with attributes and unions that are stand-ins, too."""
 
 
 class _Anything(_StandIn, metaclass=_AnyClass):
@@ -84,7 +84,7 @@ class _EmptyModule(ModuleType):
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds an empty module for every slow library and each of its submodules."""
+    """Finds an empty module for every slow library and submodule."""
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> Any:
         is_slow = any(fullname == name or fullname.startswith(f"{name}.") for name in SLOW)
@@ -99,7 +99,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 @contextmanager
 def stand_ins() -> Iterator[None]:
-    """Replace slow libraries in imports inside the `with`; modules imported inside are forgotten after it.
+    """Replace slow libraries in imports inside the `with`; modules imported inside are forgotten afterwards.
 
     Does nothing where torch is loaded already: then there is no time to save.
     """
