@@ -88,7 +88,7 @@ class EgoEnv(gymnasium.Env):
         if seed is not None or self._order is None:
             self._order = EpisodeOrder.from_seed(seed)
             super().reset(seed=self._order.seed)
-            self._order.random = self.np_random
+        self._order.random = self.np_random  # Gymnasium lets users replace it
         episode, state = begin_episodes(self.source, [self._order], options or {})
         if episode.num_agents != 1:
             scenario_id = episode.world.scenes[0].scenario.scenario_id

@@ -55,10 +55,10 @@ def iterate_fields(file: BufferedIOBase, start: int, stop: int, *, is_stream: bo
         # groups (3, 4) are in no message we know: their end lies beyond the stop, so they are refused below
         length = _FIXED_SIZE.get(wire_type, stop + 1)
         if wire_type == BYTES:
-            digits = _read_varint(file, position)
+            digits = _read_varint(file, position + len(head))
             head, length = head + digits, _to_number(digits)
         elif wire_type == VARINT:
-            payload = _read_varint(file, position)
+            payload = _read_varint(file, position + len(head))
             length = len(payload)
         begin = position + len(head)
         # checked before the payload is read: a damaged length may be of any size

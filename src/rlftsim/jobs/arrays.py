@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 
 import numpy as np
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -22,6 +23,8 @@ from rlftsim.jobs.documents import explained_damage, first_line
 
 MAX_ARRAY_BYTES = 1 << 30
 """Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
+_FLOATS = {torch.float16, torch.bfloat16, torch.float32, torch.float64}
+"""Types that convert into each other; a float of 8 bits is no weight."""
 _TENSOR_DAMAGE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError)
 _ARRAY_DAMAGE = (
     *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError),
@@ -66,7 +69,7 @@ def find_misfits(
     problems += [f"unknown {name[:100]}" for name in sorted(tensors.keys() - expected.keys())]
     for name in sorted(expected.keys() & tensors.keys()):
         tensor, counterpart = tensors[name], expected[name]
-        are_floats = tensor.is_floating_point() and counterpart.is_floating_point()
+        are_floats = {tensor.dtype, counterpart.dtype} <= _FLOATS
         if tensor.shape != counterpart.shape:
             problems.append(f"{name} has shape {tuple(tensor.shape)} instead of {tuple(counterpart.shape)}")
         elif tensor.dtype != counterpart.dtype and not (may_convert and are_floats):

@@ -109,9 +109,10 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
             raise DataError(
                 f"cannot write {url} ({error.strerror}): make room there, then run the same command again."
             ) from None
+        cause = first_line(Exception(str(error)))  # with the remote file, which an OSError has beside its cause
         raise DataError(
-            f"{url}: {type(error).__name__}: {first_line(error)}: check the address, the network and the credentials "
-            "of this machine (docs/machines.md, Buckets)."
+            f"{url}: {type(error).__name__}: {cause}: check the address, the network and the credentials of this "
+            "machine (docs/machines.md, Buckets)."
         ) from error
 
 

@@ -156,7 +156,8 @@ def _bind(host: str, port: int) -> socket.socket:
         raise ConfigError(f"--port must lie between 0 and 65535, got {port}: 0 takes a free one.")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=128)
+        # an address of all hosts takes those of IPv4, too
+        return socket.create_server((host, port), family=family, backlog=128, dualstack_ipv6=host == "::")
     except OSError as error:
         # A taken or forbidden port; everything else is the host's fault, as a name that stands for no address.
         advice = "choose another --port, or 0 for a free one" if error.errno in PORT_ERRORS else "choose another --host"

@@ -489,8 +489,8 @@ def _translate(weights: dict[str, Tensor], expected: dict[str, Tensor], source: 
     named |= {second: named[first] for second, first in aliases.items()}
     # collect all problems, so that a user mends them at once
     problems = find_misfits(weights, named)
-    is_broken = {name: not weights[name].isfinite().all() for name in sorted(named.keys() & weights.keys())}
-    problems += [f"{name} holds values that are not finite" for name, broken in is_broken.items() if broken]
+    floats = {name: value for name, value in sorted(weights.items()) if name in named and value.dtype == torch.float32}
+    problems += [f"{name} holds values that are not finite" for name, x in floats.items() if not x.isfinite().all()]
     for second, first in sorted(aliases.items()):
         if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
             problems.append(f"{second} differs from {first}, which must be the same")
