@@ -101,15 +101,15 @@ class Report:
     seconds: float
     estimate: Estimate | str
 
-    def write(self, archive: Path) -> str:
-        """Write `submission.report.md` and `.json` beside the archive; returns the text."""
+    def write(self, archive: Path) -> Path:
+        """Write `submission.report.md` and `.json` beside the archive; returns the path of the text."""
         json_path, text_path = (report_path(archive, ending) for ending in ("json", "md"))
         remove_temporaries([json_path, text_path])
-        text, values = self.as_text(), vars(self) | summarize(self.check)
+        values = summarize(self.check) | vars(self)
         del values["check"]
-        write_text(text_path, text)
+        write_text(text_path, self.as_text())
         write_text(json_path, json.dumps(values, indent=1, default=asdict) + "\n")
-        return text
+        return text_path
 
     def as_text(self) -> str:
         """The report in Markdown."""

@@ -113,13 +113,13 @@ def build(
         {"model": model, "data set": str(dataset.folder), **job.plan.identity}, time.monotonic() - start,
         estimate_realism(evaluation, str(job.plan.identity["policy"]), settings),
     )  # fmt: skip
-    text = report.write(archive)
+    text_path = report.write(archive)
     _print_findings(result)
     if result.findings.has_errors:
         print_line(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
     else:
         delete_shards(job)
-    print_lines(f"{archive}: {result.size} bytes, SHA-256 {result.sha256}\n{text}")
+    print_lines(f"{archive}: {result.size} bytes, SHA-256 {result.sha256}\n{text_path}")
     return int(result.findings.has_errors)
 
 
