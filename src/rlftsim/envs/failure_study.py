@@ -8,7 +8,6 @@ A budget is a number of steps, so that the same command gives the same bytes on 
 steps at `STEPS_PER_S`.
 """
 
-import inspect
 import json
 import math
 import re
@@ -27,7 +26,7 @@ import rlftsim
 from rlftsim.envs import dangers, failures, splitting
 from rlftsim.envs.dangers import EVENTS, find_event
 from rlftsim.envs.failures import Failure, FailureChain, RepeatedEstimate, make_source
-from rlftsim.envs.planners.registry import Planner, hash_code, load_planner
+from rlftsim.envs.planners.registry import Planner, hash_code, hash_source, load_planner
 from rlftsim.envs.source import Source, check_choice
 from rlftsim.envs.splitting import KILLED
 from rlftsim.errors import ConfigError, DataError, check_types, in_short, whole_number
@@ -36,7 +35,6 @@ from rlftsim.jobs.documents import first_line, parse_json
 from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet, read_parquet_metadata
 from rlftsim.scenario.dataset import dataset_folder
-from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.types import STEP_S
 
 STEPS_PER_S = 600
@@ -82,12 +80,12 @@ class StudyConfig:
 
     def identity(self) -> dict[str, Any]:
         """Values on which pilots and repeats depend, beside the scenario."""
-        files = map(inspect.getfile, (dangers, failures, splitting))
+        estimator: tuple[Any, ...] = dangers, failures, splitting
         return {
             "planner": self.planner, "planner_code": hash_code(self.planner),
             "model": load_source(self)[1].fingerprint, "manifest": hash_manifest(dataset_folder(self.data)),
             "split": self.split, "traffic": self.traffic, "event": self.event, "particles": self.particles,
-            "estimator_code": "-".join(hash_file(file)[:16] for file in files),
+            "estimator_code": "-".join(filter(None, map(hash_source, estimator))),
             "pilot": self.pilot, "seed": self.seed, "rlftsim_version": rlftsim.__version__,
         }  # fmt: skip
 

@@ -192,7 +192,7 @@ class FailureChain:
         copies: list[list[Planner]] = [[] for _ in rows]
         for row, (path, k) in enumerate(zip(parent_paths, shared)):
             if path is None:
-                danger[row, 0] = self.event.danger(StepView(episode, state, row))
+                danger[row, 0] = measure_danger(self.event, StepView(episode, state, row), is_branching_point=False)
             else:
                 copies[row] = list(path.planners[: k + 1])
                 danger[row, : 1 + k * self.block_steps] = path.danger[: 1 + k * self.block_steps]

@@ -224,15 +224,18 @@ def hash_code(name: str) -> str:
     location, _ = _split_options(name)
     if ":" in location:
         sources.append(sys.modules[location.partition(":")[0]])
-    hashes = dict.fromkeys(filter(None, map(_hash_source, sources)))
+    hashes = dict.fromkeys(filter(None, map(hash_source, sources)))
     # without a file it may be other code than the last time
     return "-".join(hashes) or secrets.token_hex(32)
 
 
 @cache
-def _hash_source(code: Any) -> str | None:
-    """Hash of the file of a module, class or function when this process first sees the code: a later edit does not
-    drive. None = there is no file."""
+def hash_source(code: Any) -> str | None:
+    """SHA-256 of the file of some code when this process first sees the code: a later edit does not drive.
+
+    Args:
+        code: Module, class or function; None is returned where it has no file, as in a notebook.
+    """
     try:
         return hash_file(inspect.getfile(code))
     except (TypeError, OSError):
