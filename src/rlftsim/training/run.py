@@ -19,6 +19,7 @@ from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
+from rlftsim.rollout.warm_start import start_from_rollouts
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
 from rlftsim.training.data import share_cache
@@ -38,7 +39,7 @@ TrainingScenarios = Scenarios | Scenario
 
 
 def train_policy(
-    policy: object,
+    policy: Any,
     scenarios: TrainingScenarios,
     out: str | os.PathLike[str],
     settings: Any,
@@ -82,6 +83,8 @@ def train_policy(
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
     out = Path(out)
     check_folder(out, "run")
+    if start_seconds := getattr(settings, "start_seconds", ()):
+        scenarios = start_from_rollouts(policy, scenarios, start_seconds, seed=settings.seed)
     begun_with = flatten(stored_settings(out))
     processes = count_processes(
         settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size,

@@ -1,0 +1,150 @@
+"""Scenarios that begin where a policy has driven to, so that fine-tuning is about traffic of the policy's making.
+
+O tracks, A simulated agents, T simulated steps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Int64
+
+from rlftsim.errors import DataError
+from rlftsim.geometry import boxes_overlap
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.policy import Policy, get_device
+from rlftsim.rollout.simulate import Force, simulate
+from rlftsim.rollout.types import AgentStates
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    FUTURE_STEPS,
+    HISTORY_STEPS,
+    STEP_S,
+    TOTAL_STEPS,
+    Scenario,
+    Scenarios,
+    Tracks,
+)
+
+HOP_STEPS = 20
+"""Simulated steps after which agents join and leave as in the log."""
+MOST_EVALUATED = 8
+"""Tracks to predict of a scenario, those that travel farthest in the log."""
+EVALUATED_WITHIN_M, LEAST_LOGGED = 70.0, 0.7
+"""Distance of these from the ego, and share of the future that the log has of them."""
+
+
+def start_from_rollouts(
+    policy: Policy, scenarios: Scenarios, start_seconds: Sequence[float], *, seed: int
+) -> list[Scenario]:
+    """Scenarios of 9.1 s, all in memory, whose history is that of a rollout and whose future is the log's.
+
+    A policy moves all agents but the ego from the beginning of a long log. Every two seconds those leave whose log ends
+    or who stand where the ego drives, and others join where their log begins, unless the space is taken. "Now" of a
+    result is so many seconds later; its tracks to predict are chosen anew.
+
+    Args:
+        policy: Policy that drives until then, in evaluation mode.
+        scenarios: Scenarios with logs that go on for 8 s after the last start.
+        start_seconds: Seconds of driving before "now", multiples of 2; 0 = the log's own history.
+        seed: Seed of the rollouts.
+
+    Raises:
+        DataError: A log ends before.
+    """
+    steps = sorted({round(seconds / STEP_S) for seconds in start_seconds})
+    starts = []
+    with progress_bar("drive to the starts", len(scenarios)) as advance:
+        for position in range(len(scenarios)):
+            scenario = scenarios[position]
+            if scenario.num_steps < steps[-1] + TOTAL_STEPS:
+                raise DataError(
+                    f"scenario {scenario.scenario_id}: its log of {scenario.num_steps * STEP_S:.1f} s has no 8 s after "
+                    f"a start at {steps[-1] * STEP_S:g} s: rlftsim synthesize --seconds makes longer ones."
+                )
+            starts += _drive(policy, scenario, steps, derive_seed(seed, "starts", scenario.scenario_id))
+            advance()
+    return starts
+
+
+def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) -> list[Scenario]:
+    """The scenario at each of some steps of a rollout."""
+    log = scenario.tracks
+    driven = _copy(log)
+    starts = []
+    for step in range(0, steps[-1] + 1, HOP_STEPS):
+        world = replace(scenario, tracks=driven)
+        if step in steps:
+            window = world.window(step)
+            starts.append(_choose_evaluated(replace(window, tracks=_copy(window.tracks))))
+        if step < steps[-1]:
+            now, future = step + CURRENT_STEP, slice(step + HISTORY_STEPS, step + HISTORY_STEPS + HOP_STEPS)
+            window = world.window(step, HISTORY_STEPS + HOP_STEPS)  # later lights would not be read
+            batch = collate([window]).to(get_device(policy))
+            rollout = simulate(
+                policy, batch, num_rollouts=1, seed=derive_seed(seed, step), num_steps=HOP_STEPS,
+                force=_lead_ego(batch, policy.steps_per_decision),
+            )  # fmt: skip
+            is_other = window.simulated_indices != scenario.ego_index  # [A]
+            rows = window.simulated_indices[is_other]
+            path = rollout.position[0, 0, : len(is_other)].cpu().numpy()[is_other] + window.origin  # [A, T, 2]
+            last = driven.position[rows, None, now, :2]
+            driven.velocity[rows, future] = np.diff(path, axis=1, prepend=last) / STEP_S
+            driven.position[rows, future, :2], driven.position[rows, future, 2] = path, driven.position[rows, now, 2:]
+            driven.heading[rows, future] = rollout.heading[0, 0, : len(is_other)].cpu().numpy()[is_other]
+            driven.size[rows, future] = driven.size[rows, now, None]
+            driven.valid[rows, future] = True
+            _join_and_leave(driven, log, rows, scenario.ego_index, now + HOP_STEPS)
+    return starts
+
+
+def _lead_ego(batch: ScenarioBatch, stride: int) -> Force:
+    """A `force` of `simulate` that leads the ego along its log, as agents are logged around it."""
+    scenario = batch.scenarios[0]
+    is_ego = batch.object_id == int(scenario.tracks.object_id[scenario.ego_index])  # [1, A]
+
+    def force(_: object, step: int) -> AgentStates:
+        steps = slice(HISTORY_STEPS + step, HISTORY_STEPS + step + stride)
+        valid = batch.valid[..., steps] & is_ego[..., None]
+        return AgentStates(batch.position[:, None, :, steps], batch.heading[:, None, :, steps], valid[:, None])
+
+    return force
+
+
+def _copy(tracks: Tracks) -> Tracks:
+    return Tracks(**{name: values.copy() for name, values in vars(tracks).items()})
+
+
+def _join_and_leave(driven: Tracks, log: Tracks, rows: Int64[np.ndarray, "A"], ego: int, now: int) -> None:
+    """Make those valid at a step who are logged, and in whose space nobody is: neither the ego nor who drove there."""
+    is_driven = np.isin(np.arange(len(log.valid)), rows)
+    driven.valid[:, now] &= log.valid[:, now]
+    present = [ego]
+    for row in np.argsort(~is_driven, kind="stable").tolist():  # who has driven comes first
+        if row == ego or not driven.valid[row, now]:
+            continue
+        others = [ego] if is_driven[row] else present
+        overlap = boxes_overlap(
+            driven.position[others, now, :2] - driven.position[row, now, :2], driven.heading[row, now],
+            driven.heading[others, now], driven.size[row, now, :2], driven.size[others, now, :2],
+        )  # fmt: skip
+        if overlap.any():
+            driven.valid[row, : now + 1] = False
+        else:
+            present.append(row)
+
+
+def _choose_evaluated(scenario: Scenario) -> Scenario:
+    """The scenario with other tracks to predict: near the ego and logged, those that travel farthest."""
+    tracks, ego = scenario.tracks, scenario.ego_index
+    offset = tracks.position[:, CURRENT_STEP, :2] - tracks.position[ego, CURRENT_STEP, :2]
+    future = tracks.valid[:, -FUTURE_STEPS:]
+    is_nearby = tracks.valid[:, CURRENT_STEP] & (np.linalg.norm(offset, axis=-1) < EVALUATED_WITHIN_M)
+    is_candidate = is_nearby & (future.mean(-1) >= LEAST_LOGGED)  # [O]
+    is_candidate[ego] = False
+    traveled = np.where(future, np.linalg.norm(tracks.velocity[:, -FUTURE_STEPS:], axis=-1), 0).sum(-1)
+    order = np.argsort(np.where(is_candidate, -traveled, np.inf), kind="stable")
+    chosen = np.sort(order[: min(MOST_EVALUATED, int(is_candidate.sum()))]).astype(np.int32)
+    return replace(scenario, tracks_to_predict=chosen, difficulty=np.zeros(len(chosen), np.int8))
