@@ -2,6 +2,7 @@
 
 rlftsim synthesize long --seconds 70 --num-scenarios 20 --seed 900
 python benchmarks/long_worlds.py demo-tuned --data long
+python benchmarks/long_worlds.py demo-tuned --data long --starts    realism of 8 s, as the world grows older
 
 Entries are fitted on the training split; the worlds that are simulated are of the validation split, of other networks.
 """
@@ -17,6 +18,27 @@ import rlftsim as rs
 from rlftsim.evaluation.windows import HEADINGS, evaluate_windows
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.entries import fit_entries, write_entries
+from rlftsim.rollout.warm_start import choose_evaluated, start_from_rollouts
+from rlftsim.scenario.types import STEP_S, Scenario
+
+
+STARTS_S = (0, 10, 20, 30, 40, 50)
+
+
+def measure_starts(model: str, scenarios: list[Scenario], num_rollouts: int) -> None:
+    """Print the realism of 8 s that begin where the model, or the log, has driven to."""
+    policy = load_policy(model)
+    print("| begins where | " + " | ".join(f"{start} s" for start in STARTS_S) + " |\n|---|" + "--:|" * len(STARTS_S))
+    logged = [choose_evaluated(world.window(round(start / STEP_S))) for world in scenarios for start in STARTS_S]
+    for name, starts in (
+        ("the log has driven to", logged),
+        (f"{model} has driven to", start_from_rollouts(policy, scenarios, STARTS_S, seed=0)),
+    ):
+        values = [
+            rs.evaluate(policy, starts[index :: len(STARTS_S)], num_rollouts=num_rollouts).values("meta_metric")
+            for index in range(len(STARTS_S))
+        ]
+        print(f"| {name} | " + " | ".join(f"{np.nanmean(column):.4f}" for column in values) + " |", flush=True)
 
 
 def main() -> None:
@@ -27,7 +49,12 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--num-rollouts", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--starts", action="store_true", help="realism of 8 s from later seconds on, in place of all else")
     options = parser.parse_args()
+    if options.starts:
+        worlds = rs.load_dataset(options.data, "validation")
+        measure_starts(options.model, list(worlds)[: options.worlds], options.num_rollouts)
+        return
     fitted = fit_entries(list(rs.load_dataset(options.data, "training")))
     print(f"fitted: {len(fitted.entrants.speed_mps)} entrants, weights {np.round(fitted.weights, 3).tolist()}")
     policy, worlds = load_policy(options.model), rs.load_dataset(options.data, "validation")

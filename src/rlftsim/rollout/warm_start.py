@@ -78,7 +78,7 @@ def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) 
         world = replace(scenario, tracks=driven)
         if step in steps:
             window = world.window(step)
-            starts.append(_choose_evaluated(replace(window, tracks=_copy(window.tracks))))
+            starts.append(choose_evaluated(replace(window, tracks=_copy(window.tracks))))
         if step < steps[-1]:
             now, future = step + CURRENT_STEP, slice(step + HISTORY_STEPS, step + HISTORY_STEPS + HOP_STEPS)
             window = world.window(step, HISTORY_STEPS + HOP_STEPS)  # later lights would not be read
@@ -127,8 +127,8 @@ def _join_and_leave(driven: Tracks, log: Tracks, rows: Int64[np.ndarray, "A"], e
             continue
         others = [ego] if is_driven[row] else present
         overlap = boxes_overlap(
-            driven.position[others, now, :2] - driven.position[row, now, :2], driven.heading[row, now],
-            driven.heading[others, now], driven.size[row, now, :2], driven.size[others, now, :2],
+            driven.position[others, now, :2] - driven.position[row, now, :2], driven.heading[[row], now],
+            driven.heading[others, now], driven.size[[row], now, :2], driven.size[others, now, :2],
         )  # fmt: skip
         if overlap.any():
             driven.valid[row, : now + 1] = False
@@ -136,8 +136,12 @@ def _join_and_leave(driven: Tracks, log: Tracks, rows: Int64[np.ndarray, "A"], e
             present.append(row)
 
 
-def _choose_evaluated(scenario: Scenario) -> Scenario:
-    """The scenario with other tracks to predict: near the ego and logged, those that travel farthest."""
+def choose_evaluated(scenario: Scenario) -> Scenario:
+    """The scenario with other tracks to predict: near the ego and logged, those that travel farthest.
+
+    Args:
+        scenario: Window of a long log, in which those that were chosen for its beginning may be gone.
+    """
     tracks, ego = scenario.tracks, scenario.ego_index
     offset = tracks.position[:, CURRENT_STEP, :2] - tracks.position[ego, CURRENT_STEP, :2]
     future = tracks.valid[:, -FUTURE_STEPS:]
