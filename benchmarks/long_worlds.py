@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import rlftsim as rs
-from rlftsim.evaluation.windows import HEADINGS, evaluate_windows
+from rlftsim.evaluation.windows import HEADINGS, TABLES, evaluate_windows
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.entries import fit_entries, write_entries
 from rlftsim.rollout.warm_start import choose_evaluated, start_from_rollouts
@@ -70,9 +70,11 @@ def main() -> None:
             )  # fmt: skip
             print(f"{name}: {time.process_time() - start:.0f} s")
             rows += result.rows()[len(result.log) * bool(rows) :]
-    print("|", " | ".join(HEADINGS), "|\n|---|", "--:|" * (len(HEADINGS) - 1), sep="")
-    for row in rows:
-        print("|", " | ".join(row), "|")
+    for title, columns in TABLES.items():
+        print(f"\n{title}:\n")
+        print("|", " | ".join(HEADINGS[column] for column in columns), "|\n|---|", "--:|" * (len(columns) - 1), sep="")
+        for row in rows:
+            print("|", " | ".join(row[column] for column in columns), "|")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from rlftsim.envs import drive as drive_module
 from rlftsim.envs.drive import drive
 from rlftsim.envs.drive_films import choose_films, write_film
 from rlftsim.envs.drive_scenario import DriveConfig
-from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, compute_idm_acceleration
 from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planner_scores import off_road
@@ -35,6 +34,7 @@ from rlftsim.evaluation.drive_results import (
     format_drive_comparison,
     rank_scenarios,
 )
+from rlftsim.realism.map_based import OUTSIDE_M
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.shards import hash_file

@@ -9,7 +9,8 @@ import rlftsim as rs
 import scenes
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.windows import Motion, measure_windows
+from rlftsim.evaluation.motion import Motion
+from rlftsim.evaluation.windows import join_samples, measure_windows
 from rlftsim.scenario.types import HISTORY_STEPS
 
 
@@ -27,13 +28,14 @@ def test_samples_of_a_world_that_is_known():
     motion = Motion(
         position=np.stack([x, np.zeros_like(x)], -1),
         heading=np.zeros_like(x),
-        size=np.full((3, 2), 2.0),
+        size=np.full((3, 3), 2.0),
+        z=np.zeros(3),
         valid=np.ones(x.shape, bool),
         is_vehicle=np.ones(3, bool),
         ego=0,
     )
     motion.valid[2, 100:150] = False
-    first, second = measure_windows(motion)
+    first, second = measure_windows(motion, scenes.without_map())
     assert (first.density == 2).all()
     assert second.density.mean() == pytest.approx(1.5, abs=0.06)  # the third is away for half of it
     np.testing.assert_allclose(first.speed, 2.0)
@@ -44,6 +46,40 @@ def test_samples_of_a_world_that_is_known():
     assert first.gap.max() == pytest.approx(10.0)
 
 
+def test_incidents_of_a_world_that_is_known(monkeypatch):
+    monkeypatch.setattr(scenes, "TOTAL_STEPS", HISTORY_STEPS + 600)
+    light = scenes.light(1, 33.7, 0.2, red_until=10**6)
+    scenario = scenes.build_scenario("long", map_features=scenes.straight_map(), lights=light)
+    time = np.arange(600) / 10
+    movers = [  # x, y, heading
+        (-30.0, 3.7, np.pi),  # stands, and the way is free
+        (-22.0, 3.7, np.pi),  # stands behind it
+        (30.0, 0.2, 0.0),  # waits at the red light
+        (5 * time, 0.2, 0.0),  # passes it after 6.8 s
+        (60.0, -2.4, 0.0),  # is parked beside the lane, half off the road
+        (130 - time, 3.7 + 0.1 * time, np.pi),  # its corner is 0.3 m off the road after 14.5 s
+        (20.0, -3 + time, np.pi / 2),  # a pedestrian crosses the road
+    ]
+    x, y, heading = (np.stack([np.broadcast_to(mover[axis], 600) for mover in movers]) for axis in range(3))
+    motion = Motion(
+        position=np.stack([x, y], -1) + scenes.EGO_POSITION_M - scenario.origin,
+        heading=heading,
+        size=np.array([*[(4.6, 1.9, 1.6)] * 6, (0.9, 0.8, 1.7)]),
+        z=np.full(7, 3.8),
+        valid=np.ones(x.shape, bool),
+        is_vehicle=np.arange(7) < 6,
+        ego=0,
+    )
+    windows = measure_windows(motion, scenario)
+    assert [float(window.departures.sum()) for window in windows] == [0, 1, 0, 0, 0, 0]
+    assert [float(window.red_lights.sum()) for window in windows] == [1, 0, 0, 0, 0, 0]
+    assert [float(window.stuck.sum()) for window in windows] == [0, 0, 19, 20, 20, 20]
+    # on a lane are three that stand: one drives on beyond the map's end, one off the road
+    assert [window.stuck.mean() for window in windows[3:]] == pytest.approx([1 / 3] * 3)
+    motion.valid[0, 400:450] = False  # is away for 5 s: whoever comes then has not stood
+    assert join_samples(measure_windows(motion, scenario)[4:]).stuck.sum() == 0
+
+
 def test_who_drives_as_the_log_has_ratios_of_one(long_road, tmp_path):
     result = rs.evaluate("constant_velocity", [long_road], num_rollouts=2, seconds=20.0, out=tmp_path)
     assert [row[:2] for row in result.rows()] == [
@@ -51,7 +87,7 @@ def test_who_drives_as_the_log_has_ratios_of_one(long_road, tmp_path):
     ]
     for row in result.rows()[2:]:
         assert all("(1.00)" in row[column] for column in (2, 3, 4, 7))
-        assert row[5] == "0.00"
+        assert (row[5], row[10:]) == ("0.00", ["0.00", "0.00", "0.0"])
     path = tmp_path / "constant_velocity.csv"
     with path.open() as file:
         lines = list(csv.DictReader(file))

@@ -19,10 +19,10 @@ from rlftsim.envs.actions import ACCELERATION_MPS2, signed_speed, to_heading_fra
 from rlftsim.envs.contact import STOPPED_MPS, Collision
 from rlftsim.envs.episode import Episode, EpisodeState, off_road_m
 from rlftsim.envs.planner_scores import find_signals, passes_red_light
-from rlftsim.envs.road import OUTSIDE_M
 from rlftsim.envs.world import find_lights, find_presence
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.geometry import wrapped
+from rlftsim.realism.map_based import OUTSIDE_M
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 
 HARD_BRAKING_MPS2 = 6.0

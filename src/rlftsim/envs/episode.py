@@ -17,12 +17,12 @@ from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, classify_collision
 from rlftsim.envs.observations import FAR_M, Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
-from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
+from rlftsim.envs.road import MAX_PAIRS, nearest_edges, road_edges
 from rlftsim.envs.route import SPACING_M, find_route
 from rlftsim.envs.world import Dice, World, WorldState, begin, find_presence, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.goals.types import PointById
-from rlftsim.realism.map_based import RoadEdges, compute_point_distance_to_road_edge, join_road_edges
+from rlftsim.realism.map_based import OUTSIDE_M, RoadEdges, compute_point_distance_to_road_edge, join_road_edges
 from rlftsim.scenario.types import FUTURE_STEPS
 from rlftsim.viewer.scene import SIMPLIFY_TOLERANCE_M
 

@@ -16,11 +16,11 @@ from scipy.signal import savgol_filter
 
 from rlftsim.envs.contact import BEHIND_RAD, in_one_lane, lane_search
 from rlftsim.envs.record import Record
-from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
+from rlftsim.envs.road import MAX_PAIRS, road_edges
 from rlftsim.envs.route import Route
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
-from rlftsim.realism.map_based import compute_point_distance_to_road_edge
+from rlftsim.realism.map_based import OUTSIDE_M, compute_point_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
 from rlftsim.scenario.types import (
     CURRENT_STEP,

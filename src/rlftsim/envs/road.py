@@ -10,8 +10,6 @@ from jaxtyping import Bool, Float
 from rlftsim.realism.map_based import RoadEdges, build_road_edges
 from rlftsim.scenario.types import Scenario, cached_on_scenario
 
-OUTSIDE_M = 0.3
-"""A corner this far off the road leaves the drivable area, as in nuPlan."""
 MAX_PAIRS = 1 << 22
 """Bounds the memory of the search for road edges."""
 

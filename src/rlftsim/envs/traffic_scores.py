@@ -15,11 +15,11 @@ from jaxtyping import Bool, Int64, Shaped
 from rlftsim.envs.contact import Collision, lane_search
 from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, measure_wrong_way
 from rlftsim.envs.record import Record
-from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
+from rlftsim.envs.road import MAX_PAIRS, road_edges
 from rlftsim.geometry import wrapped
 from rlftsim.realism import METRIC_2025, SimulatedStates, score
 from rlftsim.realism.agents import Trajectories
-from rlftsim.realism.map_based import compute_distance_to_road_edge
+from rlftsim.realism.map_based import OUTSIDE_M, compute_distance_to_road_edge
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, ObjectType, Scenario, cached_on_scenario
 from rlftsim.viewer.scene import compute_overlap
 

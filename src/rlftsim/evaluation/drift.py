@@ -112,7 +112,7 @@ def _stops(speed: Float[np.ndarray, "*n T"], valid: Bool[np.ndarray, "k T"]) -> 
     return np.asarray(np.lib.stride_tricks.sliding_window_view(stands, STOP_STEPS, axis=-1).all(-1).any(-1))
 
 
-class _LanePoints(NamedTuple):
+class LanePoints(NamedTuple):
     """Points along the centers of all lanes."""
 
     tree: KDTree
@@ -122,8 +122,8 @@ class _LanePoints(NamedTuple):
 
 
 @cached_on_scenario
-def _lane_points(scenario: Scenario) -> _LanePoints | None:
-    """None where the map has no lane."""
+def lane_points(scenario: Scenario) -> LanePoints | None:
+    """Points of a scenario's lanes, world frame, m; None where the map has no lane."""
     lines = []
     for line in lane_graph(scenario).lines:
         points = densify(line[:, :2], LANE_SPACING_M)
@@ -136,7 +136,7 @@ def _lane_points(scenario: Scenario) -> _LanePoints | None:
     if not lines:
         return None
     position, heading, curved = (np.concatenate(arrays) for arrays in zip(*lines))
-    return _LanePoints(KDTree(position), position, heading, curved)
+    return LanePoints(KDTree(position), position, heading, curved)
 
 
 def _measure_lanes(
@@ -146,7 +146,7 @@ def _measure_lanes(
     tracked: Int[np.ndarray, "E"],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Mean offset from the lane center, m, and mean angle to the lane, rad; each on straight and on curved lanes."""
-    lanes = _lane_points(scenario)
+    lanes = lane_points(scenario)
     vehicles = scenario.tracks.object_type[tracked] == ObjectType.VEHICLE
     if lanes is None or not vehicles.any():
         return (float("nan"), float("nan")), (float("nan"), float("nan"))

@@ -1,21 +1,23 @@
 """Long rollouts held against the log of the same world, in windows of 10 s.
 
-A agents, S steps of 0.1 s after the current one, K vehicles that follow another.
+Agents are sampled at every fifth step of 0.1 s.
 """
 
 import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.incidents import Incidents, find_incidents
+from rlftsim.evaluation.motion import MOVING_MPS, STRIDE, Motion, measure_gaps, read_log, read_rollouts
 from rlftsim.evaluation.resumable import check_same_work
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_name
@@ -25,13 +27,10 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
-from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import (
-    CURRENT_STEP,
     HISTORY_STEPS,
     STEP_S,
-    ObjectType,
     Scenario,
     Scenarios,
     count_steps,
@@ -40,64 +39,14 @@ from rlftsim.scenario.types import (
 from rlftsim.viewer.scene import compute_overlap
 
 WINDOW_STEPS = 100
-STRIDE = 5
-"""Steps between samples of density, speed, gaps and overlaps."""
 NEAR_M = 60.0
-MOVING_MPS = 0.5
-LANE_HALF_WIDTH_M, LONGEST_GAP_M = 1.8, 60.0
+LONGEST_GAP_M = 60.0
 HEADINGS = (
     "world", "seconds", "agents within 60 m", "that move", "speed of these [m/s]", "W1 of speed [m/s]", "W1 of gap [m]",
-    "ego [m/s]", "collisions per agent-min", "entries per min",
+    "ego [m/s]", "entries per min", "collisions", "road departures", "red lights", "stand > 20 s, way free [%]",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Agents of a world over time, map frame."""
-
-    position: Float[np.ndarray, "A S 2"]
-    heading: Float[np.ndarray, "A S"]
-    size: Float[np.ndarray, "A 2"]
-    valid: Bool[np.ndarray, "A S"]
-    is_vehicle: Bool[np.ndarray, "A"]
-    ego: int
-
-    def steps(self, steps: slice) -> "Motion":
-        """Motion over some of the steps."""
-        cut = {name: getattr(self, name)[:, steps] for name in ("position", "heading", "valid")}
-        return replace(self, **cut)
-
-
-def read_log(scenario: Scenario) -> Motion:
-    """Motion of all agents of a log after the current step, those included that are seen later.
-
-    Args:
-        scenario: World with a log of any length.
-    """
-    tracks, future = scenario.tracks, slice(CURRENT_STEP + 1, None)
-    size = np.where(tracks.valid[..., None], tracks.size, 0).max(1)[:, :2]
-    return Motion(
-        tracks.position[:, future, :2] - scenario.origin, tracks.heading[:, future], size, tracks.valid[:, future],
-        tracks.object_type == ObjectType.VEHICLE, scenario.ego_index,
-    )  # fmt: skip
-
-
-def read_rollouts(scenario: Scenario, rollouts: Rollouts) -> Iterator[Motion]:
-    """Motion in each rollout of a scenario.
-
-    Args:
-        scenario: World as it was simulated, with visitors where agents enter.
-        rollouts: Rollouts of that world alone.
-    """
-    tracks, simulated = scenario.tracks, scenario.simulated_indices
-    ego = int(np.flatnonzero(simulated == scenario.ego_index)[0])
-    for number in range(rollouts.num_rollouts):
-        position, heading = rollouts.position[0, number].cpu().numpy(), rollouts.heading[0, number].cpu().numpy()
-        valid = np.ones(heading.shape, bool) if rollouts.valid is None else rollouts.valid[0, number].cpu().numpy()
-        is_vehicle = tracks.object_type[simulated] == ObjectType.VEHICLE
-        count = len(simulated)  # padding comes behind
-        size = tracks.size[simulated, CURRENT_STEP, :2]
-        yield Motion(position[:count], heading[:count], size, valid[:count], is_vehicle, ego)
+TABLES = {"traffic": (0, 1, 2, 3, 4, 5, 6, 7, 8), "incidents per agent-minute": (0, 1, 9, 10, 11, 12)}
+"""Columns of each table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +64,12 @@ class WindowSamples:
     ego_speed: Float[np.ndarray, "_"]
     collisions: Float[np.ndarray, "_"]
     """Agents that begin to overlap another agent, in each world."""
+    departures: Float[np.ndarray, "_"]
+    """Vehicles that leave the road, in each world."""
+    red_lights: Float[np.ndarray, "_"]
+    """Vehicles that pass a red light, in each world."""
+    stuck: Float[np.ndarray, "_"]
+    """1 for a vehicle on a lane that has stood for more than 20 s with nothing ahead, 0 for another one on a lane."""
     entries: Float[np.ndarray, "_"]
     """Agents that appear, in each world."""
     agent_minutes: Float[np.ndarray, "_"]
@@ -169,11 +124,17 @@ def _summarize(samples: WindowSamples, log: WindowSamples) -> dict[str, float]:
     """Means of a window, by column; NaN where there are no samples."""
     means = {name: float(values.mean()) if len(values) else math.nan for name, values in vars(samples).items()}
     minutes = float(samples.agent_minutes.sum())
+
+    def rate(events: Float[np.ndarray, "_"]) -> float:
+        return float(events.sum()) / minutes if minutes else math.nan
+
     return {
         "agents_within_60_m": means["density"], "moving": means["driving"], "speed_mps": means["speed"],
         "w1_speed_mps": compute_distance(samples.speed, log.speed), "w1_gap_m": compute_distance(samples.gap, log.gap),
         "ego_speed_mps": means["ego_speed"], "entries_per_min": 6 * means["entries"],
-        "collisions_per_agent_min": float(samples.collisions.sum()) / minutes if minutes else math.nan,
+        "collisions_per_agent_min": rate(samples.collisions),
+        "road_departures_per_agent_min": rate(samples.departures),
+        "red_lights_per_agent_min": rate(samples.red_lights), "stuck_share": means["stuck"],
     }  # fmt: skip
 
 
@@ -187,7 +148,9 @@ def _format_values(row: Mapping[str, Any], log: Mapping[str, Any]) -> list[str]:
     return [
         row["world"], f"{row['start_s']}-{row['end_s']}", *map(compare, ("agents_within_60_m", "moving", "speed_mps")),
         f"{row['w1_speed_mps']:.2f}", f"{row['w1_gap_m']:.1f}", compare("ego_speed_mps"),
-        f"{row['collisions_per_agent_min']:.2f}", f"{row['entries_per_min']:.0f}",
+        f"{row['entries_per_min']:.0f}", f"{row['collisions_per_agent_min']:.2f}",
+        f"{row['road_departures_per_agent_min']:.2f}", f"{row['red_lights_per_agent_min']:.2f}",
+        f"{100 * row['stuck_share']:.1f}",
     ]  # fmt: skip
 
 
@@ -246,15 +209,16 @@ def evaluate_windows(
         _check_path(path, identity)
     with progress_bar(f"evaluate {name}", len(scenarios)) as advance:
         for position in range(len(scenarios)):
-            scenario = scenarios[position] if entry_model is None else add_visitors(scenarios[position])
+            world = scenarios[position]
+            scenario = world if entry_model is None else add_visitors(world)
             batch = collate([scenario]).to(get_device(policy))
-            logs.append(measure_windows(read_log(scenarios[position]).steps(slice(num_steps))))
+            logs.append(measure_windows(read_log(world).steps(slice(num_steps)), world))
             for first in range(0, num_rollouts, rollouts_per_pass):
                 simulated = simulate(
                     policy, batch, num_rollouts=range(first, min(first + rollouts_per_pass, num_rollouts)), seed=seed,
                     num_steps=num_steps, sampling=sampling, entries=entry_model,
                 )  # fmt: skip
-                rollouts += map(measure_windows, read_rollouts(scenario, simulated))
+                rollouts += [measure_windows(motion, world) for motion in read_rollouts(scenario, simulated)]
             advance()
     if not logs:
         raise DataError("there are no scenarios to evaluate.")
@@ -265,14 +229,22 @@ def evaluate_windows(
     return result
 
 
-def measure_windows(motion: Motion) -> list[WindowSamples]:
+def measure_windows(motion: Motion, scenario: Scenario) -> list[WindowSamples]:
     """Samples of each 10 s of a world.
 
     Args:
         motion: Motion of all agents; what is left behind the last 10 s does not count.
+        scenario: World with the map and the lights.
     """
-    num_windows = motion.heading.shape[1] // WINDOW_STEPS
-    return [_measure(motion.steps(slice(k * WINDOW_STEPS, (k + 1) * WINDOW_STEPS))) for k in range(num_windows)]
+    num_windows, num_samples = motion.heading.shape[1] // WINDOW_STEPS, WINDOW_STEPS // STRIDE
+    incidents = find_incidents(motion.steps(slice(num_windows * WINDOW_STEPS)), scenario)
+    return [
+        _measure(
+            motion.steps(slice(k * WINDOW_STEPS, (k + 1) * WINDOW_STEPS)),
+            incidents.samples(slice(k * num_samples, (k + 1) * num_samples)),
+        )
+        for k in range(num_windows)
+    ]
 
 
 def join_samples(samples: Sequence[WindowSamples]) -> WindowSamples:
@@ -297,7 +269,7 @@ def compute_distance(first: Float[np.ndarray, "k"], second: Float[np.ndarray, "m
     return float(np.abs(np.quantile(first, levels) - np.quantile(second, levels)).mean())
 
 
-def _measure(motion: Motion) -> WindowSamples:
+def _measure(motion: Motion, incidents: Incidents) -> WindowSamples:
     velocity = np.diff(motion.position, axis=1) / STEP_S
     sampled = slice(0, velocity.shape[1], STRIDE)
     has_speed = (motion.valid[:, 1:] & motion.valid[:, :-1])[:, sampled]
@@ -311,28 +283,18 @@ def _measure(motion: Motion) -> WindowSamples:
         position[None], heading[None], motion.size[:, 0], motion.size[:, 1], valid[None]
     )[0]  # fmt: skip
     begins = overlap[:, 1:] & ~overlap[:, :-1] & valid[:, :-1]
+    gap = measure_gaps(position, heading, is_moving & is_vehicle, valid & is_vehicle)
     appears = motion.valid[:, 1:] & ~motion.valid[:, :-1]
     return WindowSamples(
         density=is_nearby.sum(0).astype(float),
         driving=is_moving.sum(0).astype(float),
         speed=speed[is_moving],
-        gap=_measure_gaps(position, heading, is_moving & is_vehicle, valid & is_vehicle),
+        gap=gap[gap < LONGEST_GAP_M],
         ego_speed=speed[motion.ego],
         collisions=np.array([float(begins.sum())]),
+        departures=np.array([float(incidents.leaves_road.sum())]),
+        red_lights=np.array([float(incidents.passes_red.sum())]),
+        stuck=incidents.is_stuck[incidents.is_on_lane].astype(float),
         entries=np.array([float(appears.sum())]),
         agent_minutes=np.array([motion.valid.sum() * STEP_S / 60]),
     )
-
-
-def _measure_gaps(
-    position: Float[np.ndarray, "A S 2"], heading: Float[np.ndarray, "A S"], follows: Bool[np.ndarray, "A S"],
-    valid: Bool[np.ndarray, "A S"],
-) -> Float[np.ndarray, "K"]:  # fmt: skip
-    """Distance of the centers to the nearest vehicle ahead, of those that have one within 60 m."""
-    agent, step = np.nonzero(follows)
-    offset = position[:, step] - position[agent, step]  # [A, K, 2]
-    cos, sin = np.cos(heading[agent, step]), np.sin(heading[agent, step])
-    ahead, left = offset[..., 0] * cos + offset[..., 1] * sin, offset[..., 1] * cos - offset[..., 0] * sin
-    leads = valid[:, step] & (ahead > 0.5) & (ahead < LONGEST_GAP_M) & (np.abs(left) < LANE_HALF_WIDTH_M)
-    gap = np.where(leads, ahead, np.inf).min(0)
-    return gap[np.isfinite(gap)]

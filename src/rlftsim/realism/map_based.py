@@ -23,6 +23,8 @@ from rlftsim.scenario.types import ROAD_EDGE_TYPES, MapFeatures
 
 HEIGHT_STRETCH = 3.0
 """Factor on heights when the nearest road edge is chosen, so that agents below a bridge do not get its edge."""
+OUTSIDE_M = 0.3
+"""A corner this far off the road leaves the drivable area, as in nuPlan."""
 CLOSED_SQUARED_M2 = 1.0
 """Polylines whose ends are nearer than this (squared, in space) are closed."""
 GROUP_STEPS = 8

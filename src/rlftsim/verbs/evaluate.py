@@ -11,7 +11,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import format_table
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.evaluation.windows import HEADINGS, WindowEvaluation, evaluate_windows
+from rlftsim.evaluation.windows import HEADINGS, TABLES, WindowEvaluation, evaluate_windows
 from rlftsim.jobs.progress import print_line, print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.hub import pin_model
@@ -65,7 +65,7 @@ def evaluate(
 
     Writes the results of each scenario to OUT/NAME.parquet. An interrupted evaluation continues when the same command
     is repeated. Rollouts of a minute are held against the log in windows of 10 s instead: density, speed, gaps,
-    collisions and entries, in OUT/NAME.csv.
+    entries and incidents, in OUT/NAME.csv.
 
     Args:
         policy: Run, model folder, registered name such as "constant_velocity", or "oracle" (the log itself: the
@@ -151,10 +151,11 @@ def print_evaluation(result: Evaluation | WindowEvaluation, *, out: Path) -> Non
         DataError: No scenario could be scored.
     """
     if isinstance(result, WindowEvaluation):
-        table = Table(*HEADINGS)
-        for row in result.rows():
-            table.add_row(*row)
-        print_wide(table)
+        for title, columns in TABLES.items():
+            table = Table(*(HEADINGS[column] for column in columns), title=title, title_justify="left")
+            for row in result.rows():
+                table.add_row(*(row[column] for column in columns))
+            print_wide(table)
         return print_line(f"{out / result.name}.csv")
     if not len(result):
         raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")

@@ -26,8 +26,9 @@ from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration
 from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
 from rlftsim.envs.planners.batch import BatchPlanner, Observe
 from rlftsim.envs.planners.view import View, read_view
-from rlftsim.envs.road import OUTSIDE_M, nearest_edges
+from rlftsim.envs.road import nearest_edges
 from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
+from rlftsim.realism.map_based import OUTSIDE_M
 from rlftsim.scenario.types import STEP_S
 
 SPEED_FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)
