@@ -49,7 +49,9 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--num-rollouts", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--starts", action="store_true", help="realism of 8 s from later seconds on, in place of all else")
+    parser.add_argument(
+        "--starts", action="store_true", help="realism of 8 s from later seconds on, in place of all else"
+    )
     options = parser.parse_args()
     if options.starts:
         worlds = rs.load_dataset(options.data, "validation")
