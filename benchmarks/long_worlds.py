@@ -64,11 +64,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "entries.npz"
         write_entries(file, fitted)
-        for name, entries in (("none", "none"), ("fixed-rate", "fixed-rate"), ("fitted", str(file))):
+        for name in options.entries:
             start = time.process_time()
             result = evaluate_windows(
                 policy, scenarios, seconds=options.seconds, name=name, num_rollouts=options.num_rollouts,
-                entries=entries,
+                entries=str(file) if name == "fitted" else name,
             )  # fmt: skip
             print(f"{name}: {time.process_time() - start:.0f} s")
             rows += result.rows()[len(result.log) * bool(rows) :]
