@@ -21,7 +21,6 @@ from rlftsim.rollout.entries import fit_entries, write_entries
 from rlftsim.rollout.warm_start import choose_evaluated, start_from_rollouts
 from rlftsim.scenario.types import STEP_S, Scenario
 
-
 STARTS_S = (0, 10, 20, 30, 40, 50)
 
 
@@ -49,6 +48,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--num-rollouts", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--entries", nargs="+", default=["none", "fixed-rate", "fitted"])
     parser.add_argument(
         "--starts", action="store_true", help="realism of 8 s from later seconds on, in place of all else"
     )
