@@ -8,7 +8,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constr
 OUT ?= runs/demo
 PYTEST_FLAGS ?=
 
-.PHONY: demo demo-quick test lint types types-js reference docs wheel try-wheel clean
+.PHONY: demo demo-quick test suite lint types types-js reference docs wheel try-wheel clean
 .DEFAULT_GOAL := demo
 
 ## the whole pipeline on the synthetic scenarios, to runs/demo/report.html
@@ -19,8 +19,11 @@ demo: $(BIN)/.installed
 demo-quick: $(BIN)/.installed
 	$(BIN)/rlftsim demo --quick --out $(OUT)-quick
 
-## lint, types and tests
-test: $(BIN)/.installed-test lint types
+## lint, types and tests; pyright, which has one core busy, beside the tests
+test: lint
+	$(MAKE) --no-print-directory -j 2 suite types
+
+suite: $(BIN)/.installed-test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --jaxtyping-packages=rlftsim,beartype.beartype $(PYTEST_FLAGS)
 
 lint: $(BIN)/.installed-test

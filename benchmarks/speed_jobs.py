@@ -192,7 +192,8 @@ def finetune(job: Job) -> Repeat:
     objective = {"credit": "rollout", "imitation_weight": 0.0, "kl": replace(config.kl, target=0.05)}
     known = {name: value for name, value in objective.items() if hasattr(config, name)}
     device = DeviceConfig(job.device, threads=1, precision=job.precision)
-    config = replace(config, batch_size=job.batch_size, device=device, **known)
+    num_rollouts = min(config.num_rollouts, job.num_rollouts)
+    config = replace(config, batch_size=job.batch_size, num_rollouts=num_rollouts, device=device, **known)
     folder = Path(job.inputs) / ("tiny" if job.model == "tiny" else "base/model")
     policy = SmartPolicy.from_pretrained(folder)
     dataset = ScenarioDataset(pack_path() if job.data == "synthetic" else Path(job.inputs) / "real", "training")

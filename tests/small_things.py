@@ -20,6 +20,7 @@ from alpasim_files import write_alpasim
 from av2_files import write_av2
 from gpudrive_files import write_file
 from made_up import CPU, TINY
+from rlftsim.evaluation import scenario_pages
 from rlftsim.policies.registry import POLICIES
 from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk_vocabulary
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
@@ -29,6 +30,7 @@ from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.tfrecord import write_records
 from rlftsim.tokens.clustering import build_vocabulary
+from rlftsim.viewer.film import to_film
 from table_files import write_tables
 from womd_messages import build_message
 
@@ -160,12 +162,14 @@ def small(recipe: Recipe) -> Recipe:
     }
     model = TINY_BOTS if isinstance(recipe.model, TrafficBotsConfig) else TINY.model
     finetune = replace(recipe.finetune, num_rollouts=2, rollouts_per_pass=2, **sizes)
-    return replace(recipe, tokens=recipe.tokens and TINY.tokens, model=model, finetune=finetune, **methods)
+    calibrate = recipe.calibrate and replace(recipe.calibrate, num_rollouts=2, device=CPU)
+    methods |= {"finetune": finetune, "calibrate": calibrate}
+    return replace(recipe, tokens=recipe.tokens and TINY.tokens, model=model, **methods)
 
 
 @contextmanager
 def small_world(things: Path, commands: str) -> Iterator[None]:
-    """Inside, "synthetic" has four scenarios, and recipes and models that ship are small.
+    """Inside, "synthetic" has four scenarios; recipes, models that ship and films of reports are small.
 
     Args:
         things: folder that `write_things` has filled.
@@ -180,6 +184,8 @@ def small_world(things: Path, commands: str) -> Iterator[None]:
         for name, run in models.items():
             patch.setitem(POLICIES._registered, name, lambda run=run: rs.load_policy(things / "runs" / run))
         patch.setattr("rlftsim.scenario.dataset.pack_path", lambda: folder)
+        # a frame every two seconds
+        patch.setattr(scenario_pages, "to_film", lambda path, scene, **_: to_film(path, scene, steps_per_frame=20))
         for name in RECIPES._shipped:
             recipe = small(recipe_by_name(name))
             patch.setitem(RECIPES._registered, name, lambda recipe=recipe: recipe)

@@ -32,7 +32,7 @@ COMMAND = [
     "--split",
     "validation",
     "--limit",
-    "8",
+    "2",
     "--method",
     "nudge",
 ]

@@ -213,10 +213,10 @@ def drive_world(policy, scenario, path):
 
 
 @pytest.mark.slow
-def test_twenty_scenarios_are_driven_as_rlftsim_drive_drives_them(data):
+def test_scenarios_are_driven_as_rlftsim_drive_drives_them(data):
     policy = frozen_copy(load_policy("demo-base"))
     server, client, service = serve(policy, data)
-    for scenario in data[:20]:
+    for scenario in data[3:20:4]:  # of 11 to 55 agents
         start(client, scenario)
         path = straight_on(scenario)
         simulated = np.stack([read(answer) for answer in drive(client, path)], 1)

@@ -146,7 +146,7 @@ def test_a_task_of_the_main_module_is_handed_over_by_value(cluster, monkeypatch)
 
 
 def test_the_last_node_may_be_killed_if_another_one_comes(cluster, tmp_path):
-    paths = [tmp_path / f"{number}" for number in range(8)]
+    paths = [tmp_path / f"{number}" for number in range(6)]
     killed = []
 
     def kill_when_three_are_done(count):

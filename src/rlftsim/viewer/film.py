@@ -46,12 +46,13 @@ def to_film(
     # The last frame stays for a while, or the end could not be seen before a player starts again.
     camera, rate = Camera(animation, dots_per_inch), STEPS_PER_SECOND / steps_per_frame
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
-    steps = range(CURRENT_STEP, num_steps, steps_per_frame)
-    held = itertools.repeat(steps[-1], round(HOLD_AT_END_S * rate))
+    *earlier, last = range(CURRENT_STEP, num_steps, steps_per_frame)
 
     def write_frames(temporary: Path) -> None:
         # drawn as they are written: all frames of a minute would take a gigabyte
-        write(temporary, (camera.frame(animation.panels, step) for step in itertools.chain(steps, held)), rate)
+        frames = (camera.frame(animation.panels, step) for step in earlier)
+        held = [camera.frame(animation.panels, last)] * (1 + round(HOLD_AT_END_S * rate))
+        write(temporary, itertools.chain(frames, held), rate)
 
     write_atomically(path, write_frames)
 
