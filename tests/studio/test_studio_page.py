@@ -165,6 +165,28 @@ def test_a_user_asks_compares_saves_and_finds_it_again(page, session, browser, s
     again.close()
 
 
+def test_twelve_seconds_are_played_and_the_page_says_why_they_have_no_score(page):
+    page.open(f"#split=validation&id={SCENARIO}&panels=goals&count=4")
+    page.page.locator("#seconds").fill("12")
+    page.page.locator("#seconds").press("Enter")
+    page.wait("document.querySelector('#time').max === '130'")
+    assert "Without goals and score, which are defined for 8 seconds." in page.page.inner_text("#model-note")
+    page.page.locator("#simulate").click()
+    page.simulated()
+    assert page.state("studio.state.variants.get('goals').rollouts[0][0].valid.lastIndexOf(1)") == 130
+    page.press("End")
+    page.wait("document.querySelector('#clock').textContent.includes('+12.0 s')")
+    drawn, end = page.state("studio.stage.panels.map((p) => [p.states[0].x, p.rollouts[p.shown][0].x[130]])[0]")
+    assert drawn == pytest.approx(end, abs=1e-4)
+    assert "the metric compares 80 steps, these rollouts have 120" in page.page.inner_text("#score")
+    page.wait("location.hash.includes('seconds=12') && location.hash.includes('step=130')")
+    page.page.locator("#seconds").fill("8")
+    page.page.locator("#simulate").click()  # the field loses the focus first
+    page.wait("document.querySelector('#time').max === '90' && studio.state.time === 90")
+    page.simulated()
+    assert page.page.locator("#score .big").count() == 1
+
+
 def test_everything_can_be_done_with_keys(page):
     page.open(f"#split=validation&id={SCENARIO}&panels=log,goals&count=4")
     page.page.locator(".panel canvas").first.focus()
@@ -245,10 +267,10 @@ def test_a_goal_of_an_agent_that_is_not_there_does_not_hold_up_the_others(page):
 
 
 def test_numbers_of_an_address_are_brought_within_their_bounds(page):
-    wild = "step=1e9&rollout=-3&seed=1.5&guidance=99&count=1e9&temperature=-1&topK=0"
+    wild = "step=1e9&rollout=-3&seed=1.5&guidance=99&count=1e9&seconds=1e9&temperature=-1&topK=0"
     page.open(f"#split=validation&id={SCENARIO}&panels=log&{wild}")
-    names = ("time", "rollout", "seed", "guidance", "count", "temperature", "topK")
-    assert [page.state(f"studio.state.{name}") for name in names] == [90, 0, 2, 6, 128, 0, 1]
+    names = ("seconds", "time", "rollout", "seed", "guidance", "count", "temperature", "topK")
+    assert [page.state(f"studio.state.{name}") for name in names] == [60, 610, 0, 2, 6, 128, 0, 1]
 
 
 DELAYED = """() => {

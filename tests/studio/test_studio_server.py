@@ -174,6 +174,27 @@ def test_the_same_run_again_costs_nothing_and_a_larger_one_keeps_its_chunks(clie
     assert set(kept) == {1}  # chunk 0 was there already
 
 
+def test_a_longer_run_begins_with_the_usual_one_and_has_no_score(client, scenario):
+    tracks, rows = scenario.tracks, scenario.simulated_indices
+    current = np.concatenate(
+        [tracks.position[rows, 10, :2] - scenario.origin, tracks.heading[rows, 10, None]], -1
+    )  # fmt: skip
+    poses = []
+    for seconds in (8, 12):
+        state = client.finished(**RUN | {"models": ["demo-base"], "num_rollouts": 2, "seconds": seconds})
+        assert {e["data"]["steps"] for e in state["events"] if e["event"] == "chunk"} == {10 * seconds}
+        poses.append(decoded(client.get(f"/api/runs/{state['run']}/chunk/0").content, current))
+    assert poses[1].shape[2] == 120
+    np.testing.assert_array_equal(poses[1][:, :, :80], poses[0])
+    (variant,) = client.get(f"/api/runs/{state['run']}/score").json()["variants"]
+    assert (variant["score"], variant["events"], variant["outcomes"]) == (None, [], [])
+    assert "the metric compares 80 steps, these rollouts have 120" in variant["reason"]
+    written = client.post("/api/export", {"kind": "rollouts", "name": "minute", "run": state["run"]})
+    assert np.load(written.json()["path"])["x"].shape[2] == 120
+    refused = client.post("/api/export", {"kind": "submission", "name": "minute", "run": state["run"]})
+    assert "a submission has 8 seconds" in refused.json()["error"]
+
+
 def test_events_stream_with_ids_and_resume_behind_the_last_one(client):
     state = client.finished(**RUN | {"models": ["demo-base"], "num_rollouts": 4})
     whole = client.get(f"/api/runs/{state['run']}/events").text
@@ -238,6 +259,8 @@ def test_an_observer_that_raises_ends_a_simulation(scenario):
         ({"goals": [GOAL | {"x": 9000}]}, 422, "out of reach"),
         ({"goals": [GOAL] * 129}, 422, "goals"),
         ({"guidance": 7}, 422, "guidance"),
+        ({"goals": [GOAL], "seconds": 12}, 422, "goals are due after 8 seconds, not after 12"),
+        ({"seconds": 61}, 422, "seconds"),
         ({"metric": "2031"}, 422, "metric"),
         ({"path": "x"}, 422, "path"),
     ],

@@ -6,6 +6,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import ConfigDict, Field
 
 MAX_ROLLOUTS, MAX_GOALS, MAX_MODELS = 128, 128, 4
+USUAL_SECONDS, MAX_SECONDS = 8, 60
+"""Goals, scores and submissions are defined for the usual length."""
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 Stem = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,80}$")]
 """Name of a file below `--out`, without the ending."""
@@ -53,6 +55,7 @@ class RunBody(Body):
     top_k: Annotated[int, Field(ge=1)] | None = None
     guidance: Annotated[float, Field(ge=0, le=6)] = 1.0
     metric: Metric = "2025"
+    seconds: Annotated[int, Field(ge=USUAL_SECONDS, le=MAX_SECONDS)] = USUAL_SECONDS
 
 
 @dataclass(frozen=True)

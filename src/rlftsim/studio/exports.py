@@ -10,7 +10,7 @@ from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.studio import Refusal
-from rlftsim.studio.bodies import ExportBody, SaveGoalsBody
+from rlftsim.studio.bodies import USUAL_SECONDS, ExportBody, SaveGoalsBody
 from rlftsim.studio.runs import Run
 from rlftsim.studio.session import Session
 from rlftsim.submission.messages import encode_rollouts
@@ -76,12 +76,14 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
         body: Request with form, name of the file, variant, and first rollout of films and pages.
 
     Raises:
-        Refusal: As `resolve_path`, or the rollouts are not complete.
+        Refusal: As `resolve_path`, or the rollouts are not complete, or too long for a submission.
         DataError: The file cannot be written.
     """
     rollouts = run.rollouts(body.variant)
     if body.rollout >= run.body.num_rollouts:
         raise Refusal(f"no rollout {body.rollout + 1}: this run has {run.body.num_rollouts}.")
+    if body.kind == "submission" and run.body.seconds != USUAL_SECONDS:
+        raise Refusal(f"a submission has {USUAL_SECONDS} seconds, these rollouts have {run.body.seconds}.")
     path = resolve_path(session.out, body.name + ENDINGS[body.kind], replace=body.replace)
     scenario = session.scenario(run.body.split, run.body.scenario)
     batch = collate([scenario])

@@ -24,7 +24,6 @@ from rlftsim.rollout.policy import Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import FUTURE_STEPS
 from rlftsim.studio import Refusal
 from rlftsim.studio.bodies import RunBody
 from rlftsim.studio.encoding import encode_batch
@@ -287,7 +286,7 @@ class Worker:
                 simulated.chunks[ids] = rollouts
                 simulated.encoded[ids] = encode_batch(poses, batch)
                 run.growing.pop(k, None)
-            run.tell("chunk", k=k, variant=v, first=ids.start, count=len(ids), steps=FUTURE_STEPS)
+            run.tell("chunk", k=k, variant=v, first=ids.start, count=len(ids), steps=run.variants[v].num_steps)
             if ids.stop == run.body.num_rollouts:
                 self._score(run, v)
 
@@ -295,7 +294,7 @@ class Worker:
         v, ids = run.chunks[k]
         variant, model = run.variants[v], self.session.model(run.variants[v].model)
         policy = with_guidance(model.policy, variant.guidance)
-        num_decisions = FUTURE_STEPS // policy.steps_per_decision
+        num_decisions = variant.num_steps // policy.steps_per_decision
 
         def observe(poses: Float[Tensor, "B N A t 3"]) -> None:
             if run.stop.is_set():
@@ -314,8 +313,8 @@ class Worker:
             raise Cancelled
         goals, sampling = variant.goals_in(batch), Sampling(variant.temperature, variant.top_k)
         return simulate(
-            policy, batch, num_rollouts=ids, seed=variant.seed, context=context, goals=goals, sampling=sampling,
-            observe=observe,
+            policy, batch, num_rollouts=ids, seed=variant.seed, num_steps=variant.num_steps, context=context,
+            goals=goals, sampling=sampling, observe=observe,
         )  # fmt: skip
 
     @torch.no_grad()

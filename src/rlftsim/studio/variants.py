@@ -7,8 +7,9 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.goals.types import Goals
 from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import count_steps
 from rlftsim.studio import Refusal
-from rlftsim.studio.bodies import CheckBody, RunBody
+from rlftsim.studio.bodies import USUAL_SECONDS, CheckBody, RunBody
 from rlftsim.studio.session import Session
 
 
@@ -23,8 +24,14 @@ class Variant:
     seed: int
     temperature: float
     top_k: int | None
+    seconds: int
     guidance: float = 1.0
     goals: tuple[GoalEntry, ...] = ()
+
+    @property
+    def num_steps(self) -> int:
+        """Number of simulated steps."""
+        return count_steps(float(self.seconds))
 
     def goals_in(self, batch: ScenarioBatch) -> Goals | None:
         """Goals in the frame of a batch of the scenario; None without goals."""
@@ -51,7 +58,12 @@ def build_variants(session: Session, body: RunBody) -> Iterator[Variant]:
             f"{', '.join(m.name for m in models)} is not goal-conditioned, {len(goals)} goals would have no effect.",
             hint="Take a model that was fine-tuned with goals (docs/goals.md), or remove the goals.",
         )
-    settings = (body.split, body.scenario, body.seed, body.temperature, body.top_k)
+    if goals and body.seconds != USUAL_SECONDS:
+        raise Refusal(
+            f"goals are due after {USUAL_SECONDS} seconds, not after {body.seconds}.",
+            hint=f"Simulate {USUAL_SECONDS} seconds, or remove the goals.",
+        )
+    settings = (body.split, body.scenario, body.seed, body.temperature, body.top_k, body.seconds)
     for model in models:
         if goals and model.takes_goals:
             guidance = body.guidance if model.can_guide else 1.0

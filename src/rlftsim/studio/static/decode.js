@@ -6,11 +6,12 @@ const MAGIC = 0x31464c52, HEADER_BYTES = 20;
  * @param {ArrayBuffer} buffer
  * @param {Array} log agents of the logged motion
  * @param {number} now current step
- * @param {number} total steps, history included
+ * @param {number} [total] steps, history included; more than there are yet where a rollout grows
  */
-function decodeChunk(buffer, log, now, total) {
+function decodeChunk(buffer, log, now, total = 0) {
   const [magic, count, agents, steps, bytes] = new Uint32Array(buffer, 0, 5);
   if (magic !== MAGIC) throw new Error("these are no rollouts of this version: reload the page.");
+  total = Math.max(total, now + 1 + steps);
   const values = bytes === 2 ? new Int16Array(buffer, HEADER_BYTES) : new Int32Array(buffer, HEADER_BYTES);
   const rollouts = [];
   let at = 0;

@@ -3,7 +3,7 @@ import { post } from "./api.js";
 import { byId, closeDialog, make, openDialog, toast } from "./dom.js";
 import { agentTableOf } from "./inspector.js";
 import { wantedModels } from "./simulation.js";
-import { changed, goalsText, ownGoals, setGoals, state, toHash } from "./state.js";
+import { USUAL_SECONDS, changed, goalsText, ownGoals, setGoals, state, toHash } from "./state.js";
 
 const KEYS = [
   ["Space", "play or pause"], ["← →", "one step, with Shift one second"], ["Home End", "first and last step"], ["[ ]", "rollout before, next"], ["A", "all rollouts or one"],
@@ -67,11 +67,12 @@ const quoted = (text) => (/^[\w./:=@,+-]+$/.test(text) ? text : `'${text.replace
 /** The command line that gives the same rollouts, one line for each model. */
 function commands() {
   return wantedModels().map((name) => {
-    const model = state.session.models.find((one) => one.name === name), goals = model.takes_goals ? ownGoals() : [];
+    const model = state.session.models.find((one) => one.name === name), goals = model.takes_goals && state.seconds === USUAL_SECONDS ? ownGoals() : [];
     const words = ["rlftsim", "simulate", model.source, "--data", state.session.data, "--split", state.split, "--scenario", state.id, "--out", `${stem(`${name}-${state.id}`)}`,
       "--num-rollouts", String(state.count), "--seed", String(state.seed)];
     if (state.temperature !== 1) words.push("--temperature", String(state.temperature));
     if (state.topK) words.push("--top-k", String(state.topK));
+    if (state.seconds !== USUAL_SECONDS) words.push("--seconds", String(state.seconds));
     for (const goal of goals) words.push("--goal", `${goal.agent}=${goal.x},${goal.y}`);
     if (goals.length && model.can_guide && state.guidance !== 1) words.push("--guidance-scale", String(state.guidance));
     return words.map(quoted).join(" ");

@@ -7,7 +7,7 @@ import { goalModels, indexOf, renderAgent, renderResults, renderScore, sentence 
 import { ScenarioList } from "./list.js";
 import { IMPORTED, cancel, forget, loadImported, modelOf, simulate, simulateSoon, wantedModels } from "./simulation.js";
 import { FrameMeter, Ground, MANEUVER_NAMES, Panel } from "./stage.js";
-import { changed, fromHash, goalOf, goalsText, onChange, ownGoals, putGoal, redo, removeGoal, setGoals, state, toHash, undo } from "./state.js";
+import { USUAL_SECONDS, changed, fromHash, goalOf, goalsText, onChange, ownGoals, putGoal, redo, removeGoal, setGoals, state, toHash, undo } from "./state.js";
 import { Timeline } from "./timeline.js";
 
 const MAX_PANELS = 4, SNAP_M = 1.5, PIN_HIT_PX = 12, CLICK_PX = 4, ALIVE_MS = 1500, LEAST_R = 6, MOST_R = 500, PLACE_AHEAD_S = 4, REST_MS = 400;
@@ -193,7 +193,7 @@ function commitPlacing() {
 
 /** Checks changed goals, then takes a quick look at what they do; refused ones are left out of it. */
 async function lookAtGoals() {
-  const id = state.id, looks = state.scene && goalModels().length && !state.isQuiet;
+  const id = state.id, looks = state.scene && goalModels().length && state.seconds === USUAL_SECONDS && !state.isQuiet;
   if (looks) delete byId("run-status").dataset.over;
   await checkGoals();
   if (looks && state.id === id) simulateSoon();
@@ -396,7 +396,9 @@ onChange((topics) => {
   const has = (...names) => names.some((name) => topics.has(name));
   // Before anything is drawn: the proposals of another agent must not become this one's goals.
   if (has("selection") && state.proposals?.agent !== state.selected) { state.proposals = null; loadProposals(state.selected); }
-  if (has("panels")) { stage.layout(); renderNote(); }
+  if (has("panels")) stage.layout();
+  if (has("panels", "settings")) renderNote();
+  if (has("settings")) timeline.collect();
   if (has("panels", "scene", "settings") && state.scene) loadImported();
   if (has("data", "panels", "scene")) { timeline.renderRollouts(); timeline.collect(); renderResults(); renderScore(); }
   if (has("goals")) { timeline.collect(); list.render(); lookAtGoals(); }
@@ -412,7 +414,9 @@ onChange((topics) => {
 
 function renderNote() {
   const shown = wantedModels().map((name) => state.session.models.find((model) => model.name === name));
-  byId("model-note").textContent = shown.filter((model) => !model.takes_goals).map((model) => model.note).join(" ");
+  const notes = shown.filter((model) => !model.takes_goals).map((model) => model.note);
+  if (state.seconds !== USUAL_SECONDS) notes.push(`Without goals and score, which are defined for ${USUAL_SECONDS} seconds.`);
+  byId("model-note").textContent = notes.join(" ");
   byId("guidance").disabled = !shown.some((model) => model.can_guide);
   byId("guidance").title = byId("guidance").disabled ? "No shown model has a goal logit bias that could be scaled." : "";
 }
@@ -420,6 +424,7 @@ function renderNote() {
 function bindSettings() {
   const bind = (id, name, read) => byId(id).addEventListener("change", (event) => { state[name] = read(event.target); changed("settings"); });
   bind("rollouts", "count", (element) => Number(element.value));
+  bind("seconds", "seconds", (element) => { element.value = String(Math.min(Math.max(Math.round(element.valueAsNumber || 0), Number(element.min)), Number(element.max))); return element.valueAsNumber; });
   bind("seed", "seed", (element) => Math.max(0, Math.round(element.valueAsNumber || 0)));
   bind("temperature", "temperature", (element) => (Number.isFinite(element.valueAsNumber) ? element.valueAsNumber : 1));
   bind("top-k", "topK", (element) => (element.valueAsNumber >= 1 ? Math.round(element.valueAsNumber) : null));
@@ -452,7 +457,7 @@ function bindSettings() {
 
 /** Settings of an address in the fields of the page. */
 function showSettings() {
-  byId("rollouts").value = String(state.count); byId("seed").value = String(state.seed); byId("temperature").value = String(state.temperature);
+  byId("rollouts").value = String(state.count); byId("seconds").value = String(state.seconds); byId("seed").value = String(state.seed); byId("temperature").value = String(state.temperature);
   byId("top-k").value = state.topK ?? ""; byId("metric").value = state.metric; byId("guidance").value = String(state.guidance); byId("guidance-value").value = String(state.guidance);
 }
 
@@ -475,7 +480,7 @@ function watchServer() {
 async function start() {
   state.session = await get("api/session");
   const found = fromHash(location.hash), { models, splits } = state.session, names = new Set(["log", ...models.flatMap(({ name }) => [name, `${name}|free`]), ...importedKeys()]);
-  for (const name of ["seed", "count", "temperature", "topK", "guidance", "metric", "showAll"]) if (name in found) state[name] = found[name];
+  for (const name of ["seed", "count", "seconds", "temperature", "topK", "guidance", "metric", "showAll"]) if (name in found) state[name] = found[name];
   state.split = splits.some((one) => one.name === found.split) ? found.split : state.session.split;
   // The first model that takes goals is the one to begin with.
   const first = goalModels()[0] ?? models[0];

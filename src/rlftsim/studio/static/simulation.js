@@ -2,9 +2,9 @@
 import { bytes, follow, get, post } from "./api.js";
 import { decodeChunk } from "./decode.js";
 import { byId, speak, toast } from "./dom.js";
-import { changed, ownGoals, state } from "./state.js";
+import { USUAL_SECONDS, changed, ownGoals, state } from "./state.js";
 
-const TOTAL_STEPS = 91, QUICK_ROLLOUTS = 4, REST_MS = 1000;
+const QUICK_ROLLOUTS = 4, REST_MS = 1000;
 let end = () => {}, rest = 0, versions = 0, turns = 0;
 
 const modelOf = (key) => key.split("|")[0];
@@ -25,7 +25,7 @@ async function loadImported() {
     const variant = { name, rollouts: known?.rollouts ?? [], score: null, explained: null, reason: "Loading …", metric, version: ++versions };
     state.variants.set(key, variant);
     try {
-      variant.rollouts = decodeChunk(await bytes(path), state.log.agents, state.scene.now, TOTAL_STEPS);
+      variant.rollouts = decodeChunk(await bytes(path), state.log.agents, state.scene.now);
       if (state.id !== id) return;
       variant.version = ++versions; changed("data");
       const score = await get(`${path}/score?metric=${metric}`);
@@ -40,10 +40,10 @@ async function loadImported() {
 /** What a click on simulate asks for, as the server takes it. */
 function request(count) {
   const goals = ownGoals().filter(({ agent }) => !state.doubts.get(agent)?.refused).map(({ agent, x, y, label }) => ({ agent, x, y, label }));
-  const models = wantedModels(), taken = models.some((name) => state.session.models.find((model) => model.name === name)?.takes_goals);
+  const models = wantedModels(), taken = state.seconds === USUAL_SECONDS && models.some((name) => state.session.models.find((model) => model.name === name)?.takes_goals);
   return {
     split: state.split, scenario: state.id, models, goals: taken ? goals : [], num_rollouts: count, seed: state.seed,
-    temperature: state.temperature, top_k: state.topK, guidance: state.guidance, metric: state.metric,
+    temperature: state.temperature, top_k: state.topK, guidance: state.guidance, metric: state.metric, seconds: state.seconds,
   };
 }
 
@@ -51,6 +51,7 @@ async function simulate(count = state.count) {
   clearTimeout(rest);
   if (!wantedModels().length) return toast("No panel shows a model: add one with C, then simulate.");
   end();
+  const steps = 10 * state.seconds;
   delete byId("run-status").dataset.over;
   // Whatever arrives after the next press, or after another scenario was opened, is of no use.
   const turn = ++turns, isShown = () => turn === turns;
@@ -74,10 +75,10 @@ async function simulate(count = state.count) {
   const load = (data) => {
     const place = ++asked;
     next(async () => {
-      if (place < asked && data.steps < 80) return; // a later one has more
+      if (place < asked && data.steps < steps) return; // a later one has more
       const buffer = await bytes(`api/runs/${answer.run}/chunk/${data.k}`);
       if (!isShown()) return;
-      take(fresh, names[data.variant], data, buffer);
+      take(fresh, names[data.variant], data, buffer, steps);
       if (!shown++) byId("run-status").dataset.first = String(Math.round(performance.now() - started));
     });
   };
@@ -95,9 +96,9 @@ async function simulate(count = state.count) {
 }
 
 /** Puts rollouts of a chunk in their places; a growing chunk is replaced by its later states. */
-function take(fresh, name, data, buffer) {
+function take(fresh, name, data, buffer, steps) {
   const variant = fresh.get(name);
-  variant.chunks.set(data.first, decodeChunk(buffer, state.log.agents, state.scene.now, TOTAL_STEPS));
+  variant.chunks.set(data.first, decodeChunk(buffer, state.log.agents, state.scene.now, state.scene.now + 1 + steps));
   variant.rollouts = [...variant.chunks.entries()].sort(([a], [b]) => a - b).flatMap(([, rollouts]) => rollouts);
   publish(fresh, name);
 }

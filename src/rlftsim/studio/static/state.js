@@ -1,9 +1,9 @@
 // What the page shows, as one object; goals with undo; the part of it that stands behind # in the address.
-const UNDO_STEPS = 50, LONGEST_URL = 2000;
+const UNDO_STEPS = 50, LONGEST_URL = 2000, USUAL_SECONDS = 8;
 /** Numbers of an address: least, most, and whether they are whole. */
 const NUMBERS = {
   seed: [0, Number.MAX_SAFE_INTEGER, true], count: [1, 128, true], temperature: [0, 10, false], topK: [1, Number.MAX_SAFE_INTEGER, true],
-  guidance: [0, 6, false], step: [0, 90, true], rollout: [0, 127, true], agent: [-Infinity, Infinity, true],
+  guidance: [0, 6, false], seconds: [USUAL_SECONDS, 60, true], step: [0, 610, true], rollout: [0, 127, true], agent: [-Infinity, Infinity, true],
 };
 
 const state = {
@@ -14,7 +14,7 @@ const state = {
   run: null, runName: "", selected: -1, hovered: -1,
   time: 0, rollout: 0, speed: 1, playing: false, showAll: true, trails: true,
   view: { x: 0, y: 0, r: 50 },
-  seed: 0, count: 32, temperature: 1, topK: null, guidance: 1, metric: "2025", live: false,
+  seed: 0, count: 32, seconds: USUAL_SECONDS, temperature: 1, topK: null, guidance: 1, metric: "2025", live: false,
   proposals: null, maneuvers: {}, doubts: new Map(), placing: null, loss: null,
   goals: { goals: [], alternatives: [] }, savedAs: "goals",
 };
@@ -59,7 +59,7 @@ function toHash() {
   parts.set("view", [x, y, r].map((v) => v.toFixed(1)).join(","));
   if (state.selected >= 0) parts.set("agent", String(state.selected));
   if (state.rollout) parts.set("rollout", String(state.rollout));
-  for (const [name, usual] of Object.entries({ seed: 0, count: 32, temperature: 1, topK: null, guidance: 1, metric: "2025" })) {
+  for (const [name, usual] of Object.entries({ seed: 0, count: 32, seconds: USUAL_SECONDS, temperature: 1, topK: null, guidance: 1, metric: "2025" })) {
     if (state[name] !== usual) parts.set(name, String(state[name]));
   }
   if (!state.showAll) parts.set("all", "0");
@@ -89,4 +89,4 @@ function fromHash(hash) {
   return found;
 }
 
-export { state, onChange, changed, ownGoals, goalOf, setGoals, putGoal, removeGoal, undo, redo, goalsText, toHash, fromHash };
+export { USUAL_SECONDS, state, onChange, changed, ownGoals, goalOf, setGoals, putGoal, removeGoal, undo, redo, goalsText, toHash, fromHash };
