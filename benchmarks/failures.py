@@ -22,9 +22,12 @@ from rlftsim.envs.failure_study import Study, StudyConfig, parse_budget
 from rlftsim.envs.splitting import estimate_interval
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.runner import choose_runner
+from rlftsim.scenario.open import open_dataset
+from rlftsim.statistics import cluster_bootstrap
 
 CHUNK = 100
 PLANNERS = ("idm", "pdm")
+TRAFFIC = ("demo-base", "demo-tuned")
 RATES = (1e-3, 1e-1)
 """Rates of the scenarios that are compared with brute force."""
 
@@ -117,19 +120,37 @@ def compare_with_brute_force(out: Path, size: Comparison) -> None:
     )
 
 
+def compare_studies(folder: str, base: Study, tuned: Study) -> str:
+    """Change of the event's probability in an episode, scenario by scenario, with an interval over street networks."""
+    dataset = open_dataset(folder, "validation")
+    before, after = ({s.pilot.scenario_id: s.probability for s in study.scenarios} for study in (base, tuned))
+    ids = [scenario_id for scenario_id in before if scenario_id in after]
+    change = np.array([after[scenario_id] - before[scenario_id] for scenario_id in ids])
+    result = cluster_bootstrap(change, np.array([dataset.find_cluster(scenario_id) for scenario_id in ids]))
+    low, high = result.interval
+    return (
+        f"{100 * np.mean([before[i] for i in ids]):.2f} → {100 * np.mean([after[i] for i in ids]):.2f} % of episodes, "
+        f"{100 * result.mean:+.2f} [{100 * low:+.2f}, {100 * high:+.2f}], p = {result.p_value:.2g}"
+    )
+
+
 def measure_tuning(
     out: Path, planners: Sequence[str], data: list[str], budget: str, jobs: int, limit: int | None
 ) -> None:
-    """Table: failures of each planner per 1 000 km in both kinds of traffic."""
+    """Table: failures of each planner per 1 000 km in both kinds of traffic, and the difference over street networks."""
     lines = []
     for folder in data:
         for planner in planners:
-            for model in ("demo-base", "demo-tuned"):
+            studies = []
+            for model in TRAFFIC:
                 config = StudyConfig(planner, folder, model=model, limit=limit)
                 name = f"{Path(folder).name}-{planner}-{model}"
                 study: Study = run_study(config, out / name, parse_budget(budget), lambda n: choose_runner(jobs, n))
+                studies.append(study)
                 lines.append(f"| {Path(folder).name} | {planner} | {model} | {study.describe_total()} |")
                 print(lines[-1], flush=True)
+            lines.append(f"| {Path(folder).name} | {planner} | difference | {compare_studies(folder, *studies)} |")
+            print(lines[-1], flush=True)
     write_text(
         out / "tuning.md", "\n".join(["| data | planner | traffic | events |", "|---|---|---|---|", *lines]) + "\n"
     )

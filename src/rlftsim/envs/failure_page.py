@@ -195,9 +195,10 @@ def write_failure_page(study: Study, path: Path, *, limit: int) -> None:
     cells = "".join(f"<th>{escape(heading)}</th>" for heading in HEADINGS)
     rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in study_rows(study))
     title = f"Failures of {study.config.planner}"
+    total = study.describe_total().replace("1 000 km", "1\u00a0000\u00a0km")  # no-break spaces
     intro = (
-        f"{study.describe_total()}. Traffic: {study.config.traffic}, {study.config.model}. Every film is a sample of "
-        "the traffic model: nothing is adversarial."
+        f"{total}. Traffic: {study.config.traffic}, {study.config.model}. Every film is a sample of the traffic model: "
+        "nothing is adversarial."
     )
     body = f'<h1>{escape(title)}</h1><p class="lead">{escape(intro)}</p>' + "\n".join(map(_exhibit_html, exhibits))
     table = f'<div class="table-scroll"><table class="failures-table"><tr>{cells}</tr>{rows}</table></div>'

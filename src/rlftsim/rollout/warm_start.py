@@ -39,11 +39,11 @@ EVALUATED_WITHIN_M, LEAST_LOGGED = 70.0, 0.7
 def start_from_rollouts(
     policy: Policy, scenarios: Scenarios, start_seconds: Sequence[float], *, seed: int
 ) -> list[Scenario]:
-    """Scenarios of 9.1 s, all in memory, whose history is that of a rollout and whose future is the log's.
+    """Scenarios of 9.1 s, all in memory, with the history of a rollout and the future of the log.
 
-    A policy moves all agents but the ego from the beginning of a long log. Every two seconds those leave whose log ends
-    or who stand where the ego drives, and others join where their log begins, unless the space is taken. "Now" of a
-    result is so many seconds later; its tracks to predict are chosen anew.
+    A policy moves all agents but the ego from the beginning of a long log. Every two seconds an agent leaves with the
+    end of the logged track, or in the space of the ego, and joins with the beginning, unless the space is taken. "Now"
+    of a result is so many seconds later, with new tracks to predict.
 
     Args:
         policy: Policy that drives until then, in evaluation mode.
@@ -101,7 +101,7 @@ def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) 
 
 
 def _lead_ego(batch: ScenarioBatch, stride: int) -> Force:
-    """A `force` of `simulate` that leads the ego along its log, as agents are logged around it."""
+    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego."""
     scenario = batch.scenarios[0]
     is_ego = batch.object_id == int(scenario.tracks.object_id[scenario.ego_index])  # [1, A]
 
@@ -118,7 +118,7 @@ def _copy(tracks: Tracks) -> Tracks:
 
 
 def _join_and_leave(driven: Tracks, log: Tracks, rows: Int64[np.ndarray, "A"], ego: int, now: int) -> None:
-    """Make those valid at a step who are logged, and in whose space nobody is: neither the ego nor who drove there."""
+    """Make valid at a step the logged agents in free space, free of the ego and of agents that have driven."""
     is_driven = np.isin(np.arange(len(log.valid)), rows)
     driven.valid[:, now] &= log.valid[:, now]
     present = [ego]

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.warm_start import start_from_rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.mirror import mirror_scenario
@@ -50,6 +52,21 @@ def batch_with_futures(
 def _first_window(scenario: Scenario) -> Scenario | None:
     """First 9.1 s of a longer log; None where the log is no longer, as in `_without_far_steps`."""
     return scenario.window(0) if scenario.num_steps > TOTAL_STEPS else None
+
+
+def find_starts(policy: Any, scenarios: Scenarios, settings: Any) -> Scenarios:
+    """Scenarios that begin at the `start_seconds` of the settings, in traffic of the policy; else the same scenarios.
+
+    Args:
+        policy: Policy before the first update.
+        scenarios: Training scenarios, with long logs where settings have such starts.
+        settings: Settings of a training method.
+
+    Raises:
+        DataError: A log ends before the rollouts of the last start.
+    """
+    seconds = getattr(settings, "start_seconds", ())
+    return start_from_rollouts(policy, scenarios, seconds, seed=settings.seed) if seconds else scenarios
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:

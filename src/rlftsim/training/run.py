@@ -19,10 +19,9 @@ from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
-from rlftsim.rollout.warm_start import start_from_rollouts
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
-from rlftsim.training.data import share_cache
+from rlftsim.training.data import find_starts, share_cache
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios
 from rlftsim.training.monitoring import Validator, check_validation
 from rlftsim.training.parallel import Fabric, all_reduce_sum, count_processes, forks_processes, num_sharing_memory
@@ -83,8 +82,7 @@ def train_policy(
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
     out = Path(out)
     check_folder(out, "run")
-    if start_seconds := getattr(settings, "start_seconds", ()):
-        scenarios = start_from_rollouts(policy, scenarios, start_seconds, seed=settings.seed)
+    scenarios = find_starts(policy, scenarios, settings)
     begun_with = flatten(stored_settings(out))
     processes = count_processes(
         settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size,
