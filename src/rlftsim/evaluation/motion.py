@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
+from rlftsim.viewer.scene import compute_overlap
 
 STRIDE = 5
 """Steps between samples of density, speed, gaps, overlaps and incidents."""
@@ -68,6 +69,22 @@ def read_rollouts(scenario: Scenario, rollouts: Rollouts) -> Iterator[Motion]:
         count = len(simulated)  # padding comes behind
         size, z = tracks.size[simulated, CURRENT_STEP], tracks.position[simulated, CURRENT_STEP, 2]
         yield Motion(position[:count], heading[:count], size, z, valid[:count], is_vehicle, ego)
+
+
+def find_collisions(
+    position: Float[np.ndarray, "A S 2"], heading: Float[np.ndarray, "A S"], size: Float[np.ndarray, "A 3"],
+    valid: Bool[np.ndarray, "A S"],
+) -> Bool[np.ndarray, "A S-1"]:  # fmt: skip
+    """True where an agent begins to overlap another agent; not at the first sample, nor where the agent appears.
+
+    Args:
+        position: Centers of the agents, m.
+        heading: Headings of the agents, rad.
+        size: Length, width and height of the boxes, m.
+        valid: True where an agent is present.
+    """
+    overlap = compute_overlap(position[None], heading[None], size[:, 0], size[:, 1], valid[None])[0]
+    return overlap[:, 1:] & ~overlap[:, :-1] & valid[:, :-1]
 
 
 def measure_gaps(

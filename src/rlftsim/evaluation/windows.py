@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.incidents import Incidents, find_incidents
-from rlftsim.evaluation.motion import MOVING_MPS, STRIDE, Motion, measure_gaps, read_log, read_rollouts
+from rlftsim.evaluation.motion import MOVING_MPS, STRIDE, Motion, find_collisions, measure_gaps, read_log, read_rollouts
 from rlftsim.evaluation.resumable import check_same_work
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_name
@@ -36,7 +36,6 @@ from rlftsim.scenario.types import (
     count_steps,
     list_scenario_ids,
 )
-from rlftsim.viewer.scene import compute_overlap
 
 WINDOW_STEPS = 100
 NEAR_M = 60.0
@@ -279,10 +278,7 @@ def _measure(motion: Motion, incidents: Incidents) -> WindowSamples:
     others, is_vehicle = np.arange(len(valid)) != motion.ego, motion.is_vehicle[:, None]
     is_nearby = valid & (np.linalg.norm(position - position[motion.ego], axis=-1) < NEAR_M) & others[:, None]
     is_moving = is_nearby & has_speed & (speed > MOVING_MPS)
-    overlap = compute_overlap(
-        position[None], heading[None], motion.size[:, 0], motion.size[:, 1], valid[None]
-    )[0]  # fmt: skip
-    begins = overlap[:, 1:] & ~overlap[:, :-1] & valid[:, :-1]
+    begins = find_collisions(position, heading, motion.size, valid)
     gap = measure_gaps(position, heading, is_moving & is_vehicle, valid & is_vehicle)
     appears = motion.valid[:, 1:] & ~motion.valid[:, :-1]
     return WindowSamples(
