@@ -119,3 +119,10 @@ def test_what_cannot_be_held_against_the_log_is_refused_in_one_line(long_road, t
         rs.evaluate("oracle", [long_road], seconds=10.0)
     with pytest.raises(DataError, match="too short"):
         rs.evaluate("constant_velocity", [scenes.straight_road()], seconds=30.0)
+
+
+def test_a_world_in_which_nothing_moves_has_no_incidents(monkeypatch):
+    monkeypatch.setattr(scenes, "TOTAL_STEPS", HISTORY_STEPS + 100)
+    parked = scenes.build_scenario("parked", (scenes.Mover(), scenes.Mover(x_m=20.0)), scenes.straight_map())
+    result = rs.evaluate("constant_velocity", [parked], num_rollouts=1, seconds=10.0)
+    assert [row["road_departures_per_agent_min"] for row in result.values()] == [0, 0]

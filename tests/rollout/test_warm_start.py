@@ -12,7 +12,9 @@ from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.warm_start import start_from_rollouts
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS
+from rlftsim.training.calibrate import split_scenarios
 from rlftsim.training.config import CalibrateConfig, FinetuneConfig
+from rlftsim.training.data import find_starts
 from rlftsim.training.run import train_policy
 
 EGO, LEADER, STOPS, JOINS, LEAVES = range(5)
@@ -78,5 +80,32 @@ def test_a_run_trains_on_such_starts_and_short_logs_and_odd_seconds_are_refused(
     assert model.exists()
     with pytest.raises(DataError, match="no 8 s after a start at 10 s: rlftsim synthesize --seconds"):
         start_from_rollouts(policy, [world], (10.0,), seed=0)
-    with pytest.raises(ConfigError, match=r"start_seconds are multiples of 2 s, got \(3.0,\)"):
-        FinetuneConfig(start_seconds=(3.0,))
+    for seconds in ((3.0,), (-2.0,), ()):
+        with pytest.raises(ConfigError, match="start_seconds are multiples of 2 s, at least one"):
+            start_from_rollouts(policy, [world], seconds, seed=0)
+    with pytest.raises(ConfigError, match=r"imitation_weight is 0\.1, but with start_seconds"):
+        FinetuneConfig(start_seconds=(2.0,), imitation_weight=0.1)
+    valid = world.tracks.valid.copy()
+    valid[EGO, 40 + CURRENT_STEP] = False
+    with pytest.raises(DataError, match="the log lacks the ego 4 s after the beginning"):
+        start_from_rollouts(policy, [replace(world, tracks=replace(world.tracks, valid=valid))], (4.0,), seed=0)
+
+
+def test_a_gap_in_the_log_ends_nobodys_way_and_dropout_moves_no_start(world):
+    valid = world.tracks.valid.copy()
+    valid[LEADER, 20 + CURRENT_STEP] = False
+    gap = replace(world, tracks=replace(world.tracks, valid=valid))
+    (start,) = start_from_rollouts(load_policy("constant_velocity"), [gap], (4.0,), seed=0)
+    assert LEADER in start.simulated_indices
+    policy = tiny.tiny_policy(tiny.small_vocabulary([world]), replace(tiny.MODEL, dropout=0.5)).train()
+    first, second = (find_starts(policy, [world], CalibrateConfig(start_seconds=(4.0,))) for _ in range(2))
+    np.testing.assert_array_equal(first[0].tracks.position, second[0].tracks.position)
+    assert policy.training
+
+
+def test_windows_of_a_log_are_not_on_both_sides_of_a_calibration():
+    ids = [f"log{log}@{start}" for log in range(5) for start in (100, 200)]
+    fitted, held_back = split_scenarios(CalibrateConfig(held_back=0.4), ids)
+    assert len(fitted) == 6
+    assert len(held_back) == 4
+    assert not {ids[i].split("@")[0] for i in fitted} & {ids[i].split("@")[0] for i in held_back}

@@ -33,6 +33,6 @@ def test_each_constraint_that_settings_may_name_exists():
 
 def test_a_calibration_has_an_update_for_each_batch_of_each_stage():
     config = CalibrateConfig(batch_size=4, num_scenarios=30, lengths=(0.7, 1.4))
-    fitted, held_back = split_scenarios(config, 100)
+    fitted, held_back = split_scenarios(config, [str(index) for index in range(100)])
     assert (len(fitted), len(held_back)) == (24, 6)
     assert config.num_updates(100) == 6 + 3 * 2

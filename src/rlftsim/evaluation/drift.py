@@ -122,7 +122,7 @@ class LanePoints(NamedTuple):
 
 
 @cached_on_scenario
-def lane_points(scenario: Scenario) -> LanePoints | None:
+def find_lane_points(scenario: Scenario) -> LanePoints | None:
     """Points of a scenario's lanes, world frame, m; None where the map has no lane."""
     lines = []
     for line in lane_graph(scenario).lines:
@@ -146,7 +146,7 @@ def _measure_lanes(
     tracked: Int[np.ndarray, "E"],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Mean offset from the lane center, m, and mean angle to the lane, rad; each on straight and on curved lanes."""
-    lanes = lane_points(scenario)
+    lanes = find_lane_points(scenario)
     vehicles = scenario.tracks.object_type[tracked] == ObjectType.VEHICLE
     if lanes is None or not vehicles.any():
         return (float("nan"), float("nan")), (float("nan"), float("nan"))

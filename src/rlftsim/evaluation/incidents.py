@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from rlftsim.evaluation.drift import lane_points
+from rlftsim.evaluation.drift import find_lane_points
 from rlftsim.evaluation.motion import LANE_HALF_WIDTH_M, MOVING_MPS, STRIDE, Motion, measure_gaps
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.features import DEFAULT_COMPUTE
@@ -56,42 +56,42 @@ def find_incidents(motion: Motion, scenario: Scenario) -> Incidents:
         motion: Motion over S steps, a multiple of 5.
         scenario: World with the map and the lights of these steps.
     """
-    sampled, lanes = motion.steps(slice(None, None, STRIDE)), lane_points(scenario)
+    samples, lanes = motion.steps(slice(None, None, STRIDE)), find_lane_points(scenario)
     edges, signals = _build_road(scenario)
     # 1. vehicles that are there since the sample before, and that moved since then
-    is_vehicle = sampled.valid & motion.is_vehicle[:, None]  # [A, K]
+    is_vehicle = samples.valid & motion.is_vehicle[:, None]  # [A, K]
     stays = is_vehicle.copy()
-    stays[:, 1:] &= sampled.valid[:, :-1]
+    stays[:, 1:] &= samples.valid[:, :-1]
     stays[:, 0] = False
-    driven_m = np.linalg.norm(np.diff(sampled.position, axis=1, prepend=sampled.position[:, :1]), axis=-1)
+    driven_m = np.linalg.norm(np.diff(samples.position, axis=1, prepend=samples.position[:, :1]), axis=-1)
     moves = stays & (driven_m >= MOVING_MPS * STRIDE * STEP_S)
     # 2. vehicles on lanes
     is_on_lane = np.zeros_like(moves)
     if lanes is not None:
-        distance, _ = lanes.tree.query(sampled.position[is_vehicle] + scenario.origin)
+        distance, _ = lanes.tree.query(samples.position[is_vehicle] + scenario.origin)
         is_on_lane[is_vehicle] = distance < LANE_HALF_WIDTH_M
     return Incidents(
-        leaves_road=_find_departures(sampled, moves, edges, scenario.origin),
+        leaves_road=_find_departures(samples, moves, edges, scenario.origin),
         passes_red=_find_red_lights(motion, signals, scenario.origin),
         is_on_lane=is_on_lane,
-        is_stuck=_find_stuck(sampled, stays & ~moves & is_on_lane, signals, scenario.origin),
+        is_stuck=_find_stuck(samples, stays & ~moves & is_on_lane, signals, scenario.origin),
     )
 
 
 def _find_departures(
-    sampled: Motion, moves: Bool[np.ndarray, "A K"], edges: RoadEdges | None, origin: Float[np.ndarray, "2"]
+    samples: Motion, moves: Bool[np.ndarray, "A K"], edges: RoadEdges | None, origin: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, "A K"]:
     is_off = np.zeros_like(moves)
-    if edges is None:
+    if edges is None or not moves.any():
         return is_off
-    measured = moves.copy()  # the sample before and after each that moves
-    measured[:, :-1] |= moves[:, 1:]
-    agent = np.nonzero(measured)[0]
-    x, y = (sampled.position[measured] + origin).T
-    pose = np.stack([x, y, sampled.z[agent], sampled.heading[measured]])[:, None, :, None]  # [4, 1, P, 1]
-    states, size = Trajectories(*torch.from_numpy(pose).float()), torch.from_numpy(sampled.size[agent, None]).float()
+    is_measured = moves.copy()  # the sample before and after each that moves
+    is_measured[:, :-1] |= moves[:, 1:]
+    agent = np.nonzero(is_measured)[0]
+    x, y = (samples.position[is_measured] + origin).T
+    pose = np.stack([x, y, samples.z[agent], samples.heading[is_measured]])[:, None, :, None]  # [4, 1, P, 1]
+    states, size = Trajectories(*torch.from_numpy(pose).float()), torch.from_numpy(samples.size[agent, None]).float()
     distance = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)
-    is_off[measured] = distance[0, :, 0].numpy() >= OUTSIDE_M
+    is_off[is_measured] = distance[0, :, 0].numpy() >= OUTSIDE_M
     leaves = moves & is_off
     leaves[:, 1:] &= ~is_off[:, :-1]
     return leaves
@@ -113,16 +113,16 @@ def _find_red_lights(
 
 
 def _find_stuck(
-    sampled: Motion, stands: Bool[np.ndarray, "A K"], signals: Signals | None, origin: Float[np.ndarray, "2"]
+    samples: Motion, stands: Bool[np.ndarray, "A K"], signals: Signals | None, origin: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, "A K"]:
-    position, is_met, num_samples = sampled.position, sampled.valid, stands.shape[1]
+    position, is_met, num_samples = samples.position, samples.valid, stands.shape[1]
     if signals is not None:
         steps = slice(HISTORY_STEPS, HISTORY_STEPS + STRIDE * num_samples, STRIDE)
         stop = signals.stop_start + signals.stop_progress[..., None] * signals.stop_direction  # [1, S, J, 2]
         position = np.concatenate([position, stop[0, steps].transpose(0, 1).numpy() - origin])
         is_met = np.concatenate([is_met, signals.is_red[0, steps].T.numpy()])
     is_idle = stands.copy()
-    is_idle[stands] = measure_gaps(position, sampled.heading, stands, is_met) > FREE_WAY_M
-    samples = np.arange(num_samples)
-    last_busy = np.maximum.accumulate(np.where(is_idle, -1, samples), axis=1)
-    return is_idle & ((samples - last_busy) * STRIDE * STEP_S > LONGEST_STAND_S)
+    is_idle[stands] = measure_gaps(position, samples.heading, stands, is_met) > FREE_WAY_M
+    index = np.arange(num_samples)
+    last_busy = np.maximum.accumulate(np.where(is_idle, -1, index), axis=1)
+    return is_idle & ((index - last_busy) * STRIDE * STEP_S > LONGEST_STAND_S)

@@ -1,4 +1,4 @@
-"""Scenarios that begin where a policy has driven to, so that fine-tuning is about traffic of the policy's making.
+"""Scenarios that begin where a policy has tracks to, so that fine-tuning is about traffic of the policy's making.
 
 O tracks, A simulated agents, T simulated steps.
 """
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int64
 
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.geometry import boxes_overlap
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
@@ -41,7 +41,7 @@ def start_from_rollouts(
 ) -> list[Scenario]:
     """Scenarios of 9.1 s, all in memory, with the history of a rollout and the future of the log.
 
-    A policy moves all agents but the ego from the beginning of a long log. Every two seconds an agent leaves with the
+    A policy moves all agents but the ego from the beginning of a long log. Every two seconds an agent leaves at the
     end of the logged track, or in the space of the ego, and joins with the beginning, unless the space is taken. "Now"
     of a result is so many seconds later, with new tracks to predict.
 
@@ -52,30 +52,46 @@ def start_from_rollouts(
         seed: Seed of the rollouts.
 
     Raises:
-        DataError: A log ends before.
+        ConfigError: No start, or a start that is no multiple of 2 s.
+        DataError: A log that does not go on for 8 s after the last start, or that lacks the ego at a start.
     """
     steps = sorted({round(seconds / STEP_S) for seconds in start_seconds})
+    if not steps or steps[0] < 0 or any(step % HOP_STEPS for step in steps):
+        raise ConfigError(
+            f"start_seconds are multiples of {HOP_STEPS * STEP_S:g} s, at least one, got {start_seconds}."
+        )
+    for position in range(len(scenarios)):  # before hours of driving
+        _check_log(scenarios[position], steps)
     starts = []
     with progress_bar("drive to the starts", len(scenarios)) as advance:
         for position in range(len(scenarios)):
             scenario = scenarios[position]
-            if scenario.num_steps < steps[-1] + TOTAL_STEPS:
-                raise DataError(
-                    f"scenario {scenario.scenario_id}: its log of {scenario.num_steps * STEP_S:.1f} s has no 8 s after "
-                    f"a start at {steps[-1] * STEP_S:g} s: rlftsim synthesize --seconds makes longer ones."
-                )
             starts += _drive(policy, scenario, steps, derive_seed(seed, "starts", scenario.scenario_id))
             advance()
     return starts
 
 
+def _check_log(scenario: Scenario, steps: Sequence[int]) -> None:
+    if scenario.num_steps < steps[-1] + TOTAL_STEPS:
+        raise DataError(
+            f"scenario {scenario.scenario_id}: its log of {scenario.num_steps * STEP_S:.1f} s has no 8 s after a start "
+            f"at {steps[-1] * STEP_S:g} s: rlftsim synthesize --seconds makes longer ones."
+        )
+    missing = [step for step in steps if not scenario.tracks.valid[scenario.ego_index, step + CURRENT_STEP]]
+    if missing:
+        raise DataError(
+            f"scenario {scenario.scenario_id}: the log lacks the ego {missing[0] * STEP_S:g} s after the beginning: "
+            "leave this start or the scenario out."
+        )
+
+
 def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) -> list[Scenario]:
     """The scenario at each of some steps of a rollout."""
     log = scenario.tracks
-    driven = _copy(log)
+    tracks = _copy(log)
     starts = []
     for step in range(0, steps[-1] + 1, HOP_STEPS):
-        world = replace(scenario, tracks=driven)
+        world = replace(scenario, tracks=tracks)
         if step in steps:
             window = world.window(step)
             starts.append(choose_evaluated(replace(window, tracks=_copy(window.tracks))))
@@ -90,13 +106,14 @@ def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) 
             is_other = window.simulated_indices != scenario.ego_index  # [A]
             rows = window.simulated_indices[is_other]
             path = rollout.position[0, 0, : len(is_other)].cpu().numpy()[is_other] + window.origin  # [A, T, 2]
-            last = driven.position[rows, None, now, :2]
-            driven.velocity[rows, future] = np.diff(path, axis=1, prepend=last) / STEP_S
-            driven.position[rows, future, :2], driven.position[rows, future, 2] = path, driven.position[rows, now, 2:]
-            driven.heading[rows, future] = rollout.heading[0, 0, : len(is_other)].cpu().numpy()[is_other]
-            driven.size[rows, future] = driven.size[rows, now, None]
-            driven.valid[rows, future] = True
-            _join_and_leave(driven, log, rows, scenario.ego_index, now + HOP_STEPS)
+            last = tracks.position[rows, None, now, :2]
+            tracks.velocity[rows, future] = np.diff(path, axis=1, prepend=last) / STEP_S
+            tracks.position[rows, future, :2] = path
+            tracks.position[rows, future, 2] = tracks.position[rows, now, 2:]
+            tracks.heading[rows, future] = rollout.heading[0, 0, : len(is_other)].cpu().numpy()[is_other]
+            tracks.size[rows, future] = tracks.size[rows, now, None]
+            tracks.valid[rows, future] = True
+            _join_and_leave(tracks, log, rows, scenario.ego_index, now + HOP_STEPS)
     return starts
 
 
@@ -117,21 +134,21 @@ def _copy(tracks: Tracks) -> Tracks:
     return Tracks(**{name: values.copy() for name, values in vars(tracks).items()})
 
 
-def _join_and_leave(driven: Tracks, log: Tracks, rows: Int64[np.ndarray, "A"], ego: int, now: int) -> None:
+def _join_and_leave(tracks: Tracks, log: Tracks, rows: Int64[np.ndarray, "A"], ego: int, now: int) -> None:
     """Make valid at a step the logged agents in free space, free of the ego and of agents that have driven."""
     is_driven = np.isin(np.arange(len(log.valid)), rows)
-    driven.valid[:, now] &= log.valid[:, now]
+    tracks.valid[~log.valid[:, now:].any(1), now] = False  # a gap in the log ends nobody's way
     present = [ego]
-    for row in np.argsort(~is_driven, kind="stable").tolist():  # who has driven comes first
-        if row == ego or not driven.valid[row, now]:
+    for row in np.argsort(~is_driven, kind="stable").tolist():  # who has tracks comes first
+        if row == ego or not tracks.valid[row, now]:
             continue
         others = [ego] if is_driven[row] else present
         overlap = boxes_overlap(
-            driven.position[others, now, :2] - driven.position[row, now, :2], driven.heading[[row], now],
-            driven.heading[others, now], driven.size[[row], now, :2], driven.size[others, now, :2],
+            tracks.position[others, now, :2] - tracks.position[row, now, :2], tracks.heading[[row], now],
+            tracks.heading[others, now], tracks.size[[row], now, :2], tracks.size[others, now, :2],
         )  # fmt: skip
         if overlap.any():
-            driven.valid[row, : now + 1] = False
+            tracks.valid[row, : now + 1] = False
         else:
             present.append(row)
 
@@ -150,5 +167,5 @@ def choose_evaluated(scenario: Scenario) -> Scenario:
     is_candidate[ego] = False
     traveled = np.where(future, np.linalg.norm(tracks.velocity[:, -FUTURE_STEPS:], axis=-1), 0).sum(-1)
     order = np.argsort(np.where(is_candidate, -traveled, np.inf), kind="stable")
-    chosen = np.sort(order[: min(MOST_EVALUATED, int(is_candidate.sum()))]).astype(np.int32)
-    return replace(scenario, tracks_to_predict=chosen, difficulty=np.zeros(len(chosen), np.int8))
+    predicted = np.sort(order[: min(MOST_EVALUATED, int(is_candidate.sum()))]).astype(np.int32)
+    return replace(scenario, tracks_to_predict=predicted, difficulty=np.zeros(len(predicted), np.int8))

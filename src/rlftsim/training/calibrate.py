@@ -31,7 +31,7 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import Scenarios
+from rlftsim.scenario.types import Scenarios, list_scenario_ids
 from rlftsim.training.config import CalibrateConfig
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.experience import mean_speeds
@@ -77,16 +77,22 @@ class CalibrateMethod(Method[CalibrateConfig]):
         return learner.measure(fabric)
 
 
-def split_scenarios(config: CalibrateConfig, num_scenarios: int) -> tuple[list[int], list[int]]:
+def split_scenarios(config: CalibrateConfig, scenario_ids: Sequence[str]) -> tuple[list[int], list[int]]:
     """Indices of the scenarios for the direction, and of those held back for the length.
+
+    Windows of a log stay together, all but those of one log at most.
 
     Args:
         config: Settings of the run: numbers of scenarios, and the seed.
-        num_scenarios: Number of scenarios in the data set, at least 2.
+        scenario_ids: Ids of the data set, at least 2; a window has a start behind the log's id, as in "log@100".
     """
-    num_fitted, num_held_back = config.split_sizes(num_scenarios)
+    num_fitted, num_held_back = config.split_sizes(len(scenario_ids))
     random = np.random.default_rng(derive_seed(config.seed, "calibrate") % 2**32)
-    selected = random.permutation(num_scenarios)[: num_fitted + num_held_back].tolist()
+    windows: dict[str, list[int]] = {}
+    for index, scenario_id in enumerate(scenario_ids):
+        windows.setdefault(scenario_id.split("@")[0], []).append(index)
+    logs = list(windows.values())
+    selected = [index for log in random.permutation(len(logs)) for index in logs[log]][: num_fitted + num_held_back]
     return selected[num_held_back:], selected[:num_held_back]
 
 
@@ -124,7 +130,7 @@ class CalibrationLearner(Learner):
     scenarios: Scenarios
 
     def __post_init__(self) -> None:
-        self.fitted_ids, self.held_back_ids = split_scenarios(self.config, len(self.scenarios))
+        self.fitted_ids, self.held_back_ids = split_scenarios(self.config, list(list_scenario_ids(self.scenarios)))
         self.statistics = Statistics(len(self.fitted_ids), len(self.held_back_ids), self.config)
         self.start = self.policy.eta.detach().clone()
         self.names = tuple(dict.fromkeys((*MEASURED, *CONSTRAINTS, "kl", "num_decisions")))

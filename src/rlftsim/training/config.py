@@ -81,11 +81,6 @@ def _check_up_to_1(config: object, group: str = "", **words: str) -> None:
             raise ConfigError(f"{group}{name} is {word} in [0, 1], got {getattr(config, name)}.")
 
 
-def _check_starts(seconds: tuple[float, ...]) -> None:
-    if any(start < 0 or start % 2 for start in seconds):
-        raise ConfigError(f"start_seconds are multiples of 2 s, got {seconds}.")
-
-
 def _check_betas(betas: tuple[float, float]) -> None:
     """Check Adam's decay rates.
 
@@ -295,8 +290,8 @@ class FinetuneConfig:
     num_rollouts: int = 4
     """Rollouts per scenario and update (N)."""
     start_seconds: tuple[float, ...] = ()
-    """Seconds that the initial model drives in a long log before the rollouts begin, each a scenario more; 0 = the log
-    itself. () = the first 9.1 s of the log."""
+    """Seconds that the initial model drives in long logs before the rollouts begin, each a scenario more; all of them
+    before the first update, and kept in memory. 0 = the log itself; () = the first 9.1 s of the log."""
     micro_batch_size: int = 8
     """Scenarios in memory at once, on each GPU or in all processes on a CPU together; fewer need less memory, the
     update is the same."""
@@ -362,12 +357,16 @@ class FinetuneConfig:
         check_not_negative(self, ("warmup_updates", "weight_decay", "imitation_weight"))
         check_finiteness(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus", "imitation_weight"))
         _check_betas(self.betas)
-        _check_starts(self.start_seconds)
         _check_up_to_1(self, credit_mixing="a weight")
         check_metric(self.metric)
         # Stored in one spelling, so that a run with the same reward written otherwise resumes.
         reward, depends_on_goals = complete_reward(self.reward)
         object.__setattr__(self, "reward", reward)
+        if self.start_seconds and self.imitation_weight:
+            raise ConfigError(
+                f"finetune.imitation_weight is {self.imitation_weight:g}, but with start_seconds no log goes on where "
+                "the agents are: set it to 0."
+            )
         if depends_on_goals and not self.goals.probability:
             raise ConfigError(f"reward {self.reward!r} needs goals: set finetune.goals.probability above 0, such as 1.")
         if self.hold_speed and depends_on_goals:
@@ -567,8 +566,8 @@ class CalibrateConfig:
     num_scenarios: int = 256
     """Training scenarios that are used at most, drawn with the seed."""
     start_seconds: tuple[float, ...] = ()
-    """Seconds that the initial model drives in a long log before the rollouts begin, each a scenario more; 0 = the log
-    itself. () = the first 9.1 s of the log."""
+    """Seconds that the initial model drives in long logs before the rollouts begin, each a scenario more; all of them
+    before the first update, and kept in memory. 0 = the log itself; () = the first 9.1 s of the log."""
     num_rollouts: int = 8
     """Rollouts N of each scenario and length."""
     clip: float = 3.0
@@ -590,7 +589,6 @@ class CalibrateConfig:
         )
         if self.num_rollouts < 2:
             raise ConfigError(f"credit needs at least 2 rollouts, got {self.num_rollouts}: raise num_rollouts.")
-        _check_starts(self.start_seconds)
         if not 0 < self.held_back < 1:
             raise ConfigError(f"held_back is a fraction between 0 and 1, got {self.held_back}.")
         if not self.lengths or min(self.lengths) <= 0:

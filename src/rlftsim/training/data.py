@@ -1,5 +1,6 @@
 """Scenarios, agents and steps of an update: a function of seed and update alone, which resuming relies on."""
 
+import copy
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
@@ -63,10 +64,14 @@ def find_starts(policy: Any, scenarios: Scenarios, settings: Any) -> Scenarios:
         settings: Settings of a training method.
 
     Raises:
-        DataError: A log ends before the rollouts of the last start.
+        ConfigError: A start that is no multiple of 2 s.
+        DataError: A log that does not go on for 8 s after the last start, or lacks the ego at a start.
     """
     seconds = getattr(settings, "start_seconds", ())
-    return start_from_rollouts(policy, scenarios, seconds, seed=settings.seed) if seconds else scenarios
+    if not seconds or not isinstance(policy, nn.Module):  # which the method refuses
+        return scenarios
+    driver: Any = copy.deepcopy(policy).eval()  # without dropout, or a resumed run would have other starts
+    return start_from_rollouts(driver, scenarios, seconds, seed=settings.seed)
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:

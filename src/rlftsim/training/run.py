@@ -82,7 +82,7 @@ def train_policy(
     held_out = [held_out] if isinstance(held_out, Scenario) else held_out
     out = Path(out)
     check_folder(out, "run")
-    scenarios = find_starts(policy, scenarios, settings)
+    logs, scenarios = scenarios, find_starts(policy, scenarios, settings)
     begun_with = flatten(stored_settings(out))
     processes = count_processes(
         settings.device, len(scenarios), settings.batch_size, settings.micro_batch_size,
@@ -93,7 +93,7 @@ def train_policy(
         num_updates = settings.num_updates(len(scenarios)) if held_out is not None else 0
         num_updates = min(num_updates, max_updates or num_updates)
         settings = replace(settings, validation=_fit_validation(settings, num_updates, begun_with))
-    run = TrainingRun(method, policy, scenarios, out, settings, held_out, card, max_updates, on_update, trackers)
+    run = TrainingRun(method, policy, scenarios, logs, out, settings, held_out, card, max_updates, on_update, trackers)
     with linked_processes(run.work, settings.device) as fabric:
         return run.work(fabric)
 
@@ -160,7 +160,9 @@ class TrainingRun:
     method: Method[Any]
     policy: object
     scenarios: Scenarios
-    """Training scenarios; a different data set or order of scenarios is refused."""
+    """Training scenarios."""
+    logs: Scenarios
+    """Where these begin; a different data set or order of scenarios is refused."""
     out: Path
     """Folder of the run."""
     settings: Any
@@ -225,7 +227,7 @@ class TrainingRun:
         """Open the folder, and warn of a run that ends in the warm-up."""
         learner, total = self.learner, self.settings.num_updates(len(self.scenarios))
         self.num_updates = min(total, self.max_updates or total)
-        inputs = {**describe_inputs(learner.policy, self.scenarios, self.held_out), **learner.inputs}
+        inputs = {**describe_inputs(learner.policy, self.logs, self.held_out), **learner.inputs}
         self.folder = RunFolder(self.out, self.settings, inputs, writes=self.is_first, may_grow=learner.may_grow)
         self._advance: Callable[..., object] = print
         self._best: tuple[float, int] | None = None
