@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rlftsim.cli.main import main
-from rlftsim.envs import conflicts, sumo_traffic
+from rlftsim.envs import conflicts, sumo_traffic, true_world
 from rlftsim.envs.conflicts import CROSSING, FOLLOWING, MERGING, PEDESTRIAN, find_conflicts
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.true_world import GHOST, TRUTH, TrueWorldConfig
@@ -67,6 +67,26 @@ def test_models_are_named_with_a_temperature():
         Surroundings.parse("demo-tuned@warm")
     with pytest.raises(ConfigError, match="same name"):
         TrueWorldConfig("data", (TRUTH, GHOST, TRUTH))
+
+
+@pytest.mark.parametrize(
+    "limit, wanted, windows",
+    [(None, 9, "a0 b0 a1 b1"), (1, 0, "a0"), (1, 1, "a0 b0"), (2, 2, "a0 b0 b1"), (2, 1, "a0 b0"), (2, 9, "a0 b0 b1")],
+)
+def test_conflict_windows_are_added_to_random_ones_until_there_are_enough(limit, wanted, windows, monkeypatch):
+    """Of the windows in turn, a0 b0 a1 b1, b0 and b1 have a conflict of vehicles."""
+    names = ["a0", "a1", "b0", "b1"]
+    monkeypatch.setattr(true_world, "dataset_folder", Path)
+    monkeypatch.setattr(true_world, "ScenarioDataset", lambda _: SimpleNamespace(scenario_ids=names))
+    monkeypatch.setattr(
+        true_world, "find_window", lambda _, name: SimpleNamespace(path=Path(name[0]), index=int(name[1]))
+    )
+    monkeypatch.setattr(
+        true_world, "list_conflicts", lambda _, name: frozenset({"crossing" if "b" in name else "pedestrian"})
+    )
+    config = TrueWorldConfig("data", (TRUTH,), ("log",), limit=limit, conflict_windows=wanted)
+    assert " ".join(trip.window for trip in config.trips) == windows
+    assert [trip.is_random for trip in config.trips] == [k < (limit or 4) for k in range(len(config.trips))]
 
 
 @pytest.mark.skipif(

@@ -14,6 +14,7 @@ from rlftsim.experiments.true_world import (
     find_interval,
     measure_agreement,
 )
+from rlftsim.experiments.true_world_report import choose_sets
 
 TRUTH = [[1.0, 0.8, 0.6, 0.8], [0.5, 0.5, 0.5, 0.5], [0.0, 0.2, 0.0, 0.2]]
 """Scores of three planners, means 0.8, 0.5 and 0.1, in four windows."""
@@ -105,9 +106,9 @@ def test_the_interval_of_a_mean_is_that_of_the_networks():
     assert (high - low) / 2 == pytest.approx(1.96 * of_network.std(ddof=1) / np.sqrt(40), rel=0.08)
 
 
-def make_row(window, traffic, planner, score):
+def make_row(window, traffic, planner, score, conflicts="crossing following", is_random=True):
     return {
-        "network": window[0], "window": window, "conflicts": "crossing following", "planner": planner,
+        "network": window[0], "window": window, "is_random": is_random, "conflicts": conflicts, "planner": planner,
         "traffic": traffic, "rollout": 0, "nuplan_style": score,
     }  # fmt: skip
 
@@ -126,3 +127,12 @@ def test_rows_are_arranged_and_unfinished_windows_left_out():
     assert (chosen.windows, chosen.values["nuplan_style"].shape) == (("b1",), (2, 2, 1))
     with pytest.raises(DataError, match="go on with the run"):
         arrange_episodes(rows[1:4], "truth")
+
+
+def test_random_windows_are_apart_from_those_chosen_for_a_conflict():
+    rows = [
+        make_row(name, t, "idm", 0.0, conflicts, is_random) for t in ("truth", "replay")
+        for name, conflicts, is_random in (("a1", "", True), ("b1", "crossing", True), ("c1", "merging", False))
+    ]  # fmt: skip
+    random, conflict = choose_sets(arrange_episodes(rows, "truth"))
+    assert (random.episodes.windows, conflict.episodes.windows) == (("a1", "b1"), ("b1", "c1"))

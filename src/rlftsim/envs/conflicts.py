@@ -29,6 +29,8 @@ MEETS_M, WALKS_INTO_M = 1.5, 2.0
 SAME_PLACE_M = 3.0
 """A way that meets the ego's route within this distance of the ego's center comes from behind it."""
 MOVING_MPS = 0.5
+VEHICLE_CONFLICTS = frozenset({FOLLOWING, MERGING, CROSSING})
+"""Windows with any of these are the conflict windows."""
 
 
 def find_conflicts(scenario: Scenario, data: Path) -> frozenset[str]:

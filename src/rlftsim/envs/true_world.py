@@ -7,14 +7,16 @@ stopped has measured the same of every planner.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
+from rlftsim.envs.conflicts import VEHICLE_CONFLICTS
 from rlftsim.envs.planners.registry import hash_code
-from rlftsim.envs.true_world_episode import PLANNERS, Surroundings, Trip, load_model, read_row
+from rlftsim.envs.true_world_episode import PLANNERS, Surroundings, Trip, list_conflicts, load_model, read_row
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import hash_manifest
@@ -56,17 +58,20 @@ class TrueWorldConfig:
     seed: int = 0
     limit: int | None = None
     """Only the first so many windows."""
+    conflict_windows: int = 0
+    """Conflict windows to drive: the windows after the limit that have a conflict follow, until there are so many."""
 
     def __post_init__(self) -> None:
         if self.limit is not None:
             whole_number("limit", self.limit, 1)
+        whole_number("conflict_windows", self.conflict_windows, 0)
         for label, names in (("planners", self.planners), ("models", [s.name for s in self.surroundings])):
             if len({*names}) < len(names):
                 raise ConfigError(f"{label}: two of {', '.join(names)} have the same name: leave one out.")
 
     @cached_property
     def trips(self) -> list[Trip]:
-        """All episodes, window by window, a window of each network in turn.
+        """All episodes, window by window, a window of each network in turn; chosen conflict windows come last.
 
         Raises:
             DataError: A scenario without a world.
@@ -77,10 +82,17 @@ class TrueWorldConfig:
         for name, window in sorted(windows.items(), key=lambda item: (item[1].path, item[1].index)):
             by_network.setdefault(window.path.stem, []).append(name)
         turns = sorted((turn, network) for network, names in by_network.items() for turn in range(len(names)))
+        ordered = [(by_network[network][turn], network) for turn, network in turns]
+        random, rest = ordered[: self.limit], ordered[len(ordered[: self.limit]) :]
+        missing = self.conflict_windows and self.conflict_windows - sum(map(self._has_conflict, random))
+        chosen = list(islice(filter(self._has_conflict, rest), max(0, missing)))
         return [
-            Trip(self.data, by_network[network][turn], network, surroundings, planner, self.seed)
-            for turn, network in turns[: self.limit] for surroundings in self.surroundings for planner in self.planners
+            Trip(self.data, name, network, surroundings, planner, self.seed, (name, network) in random)
+            for name, network in random + chosen for surroundings in self.surroundings for planner in self.planners
         ]  # fmt: skip
+
+    def _has_conflict(self, window: tuple[str, str]) -> bool:
+        return not VEHICLE_CONFLICTS.isdisjoint(list_conflicts(self.data, window[0]))
 
 
 def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.Table:

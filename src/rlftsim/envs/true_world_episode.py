@@ -77,6 +77,8 @@ class Trip:
     planner: str
     """Name of `PLANNERS`, or any that `load_planner` takes."""
     seed: int
+    is_random: bool = True
+    """False = the window was chosen for its conflict."""
 
     @property
     def name(self) -> str:
@@ -95,8 +97,9 @@ class Trip:
         settings = tuple(sorted(read_action_settings(planner).items()))
         env = _make_environment(self.data, self.window, self.surroundings, settings)
         row: dict[str, object] = {
-            "network": self.network, "window": self.window, "conflicts": _describe_conflicts(self.data, self.window),
-            "planner": self.planner, "traffic": self.surroundings.name, "rollout": 0,
+            "network": self.network, "window": self.window, "is_random": self.is_random,
+            "conflicts": " ".join(sorted(list_conflicts(self.data, self.window))), "planner": self.planner,
+            "traffic": self.surroundings.name, "rollout": 0,
         }  # fmt: skip
         try:
             result = run_planner(env, planner, scenario, seed=self.seed)
@@ -126,7 +129,8 @@ def read_row(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """
     row = values["row"]
     numbers = {column: float(row[column]) for column in (*SCORES, *COUNTS)}
-    return {**{column: str(row[column]) for column in TEXTS}, "rollout": int(row["rollout"]), **numbers}
+    texts = {column: str(row[column]) for column in TEXTS}
+    return {**texts, "is_random": bool(row["is_random"]), "rollout": int(row["rollout"]), **numbers}
 
 
 class _WorldSource(Source):
@@ -165,6 +169,11 @@ def _load_scenario(data: str, window: str) -> Scenario:
 
 
 @lru_cache(maxsize=2)
-def _describe_conflicts(data: str, window: str) -> str:
-    """Conflicts at the current step, separated by spaces."""
-    return " ".join(sorted(find_conflicts(_load_scenario(data, window), dataset_folder(data))))
+def list_conflicts(data: str, window: str) -> frozenset[str]:
+    """Conflicts at the current step, see `find_conflicts`.
+
+    Args:
+        data: Data set with worlds.
+        window: Id of a scenario.
+    """
+    return find_conflicts(_load_scenario(data, window), dataset_folder(data))

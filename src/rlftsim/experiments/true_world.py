@@ -18,8 +18,6 @@ from rlftsim.statistics import draw_clusters
 NUM_DRAWS = 2000
 CHANGED = 0.05
 """Episodes whose scores differ by more are counted."""
-VEHICLE_CONFLICTS = ("following", "merging", "crossing")
-"""Windows with any of these are the conflict windows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +32,8 @@ class Episodes:
     """Of each window."""
     conflicts: tuple[frozenset[str], ...]
     """Of each window."""
+    is_random: Bool[np.ndarray, "W"]
+    """False = the window was chosen for its conflict."""
     values: Mapping[str, Float[np.ndarray, "T P W"]]
     """Scores by column; NaN = the planner has failed."""
 
@@ -52,7 +52,7 @@ class Episodes:
         """Episodes of some windows."""
         chosen = np.flatnonzero(is_chosen)
         texts = {name: tuple(getattr(self, name)[k] for k in chosen) for name in ("windows", "networks", "conflicts")}
-        return replace(self, **texts, values={name: table[..., chosen] for name, table in self.values.items()})
+        return replace(self, **texts, is_random=self.is_random[chosen], values={name: table[..., chosen] for name, table in self.values.items()})
 
 
 def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
@@ -81,7 +81,8 @@ def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
     }
     networks = tuple(row["network"] for row in first)
     conflicts = tuple(frozenset(row["conflicts"].split()) for row in first)
-    return Episodes(traffic, planners, tuple(windows), networks, conflicts, values)
+    is_random = np.array([row["is_random"] for row in first])
+    return Episodes(traffic, planners, tuple(windows), networks, conflicts, is_random, values)
 
 
 def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int) -> Float[np.ndarray, "D W"]:

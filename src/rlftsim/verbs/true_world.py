@@ -16,6 +16,7 @@ def true_world(
     out: Path = Path("runs/true-world"),
     shifts: tuple[float, ...] = (0.1,),
     limit: int | None = None,
+    conflict_windows: int = 0,
     seed: int = 0,
     jobs: int = 1,
     work: Work = Work(),  # noqa: B008
@@ -36,6 +37,7 @@ def true_world(
         out: Folder for the results.
         shifts: Meters by which the world's drivers see the ego ahead of its place: the floor of every error.
         limit: Number of windows, one of each network in turn; left out, all of them.
+        conflict_windows: Windows with a conflict of vehicles to drive, of those after the limit if it has too few.
         seed: Seed of the traffic.
         jobs: Processes, each with one thread. Changes no result.
         work: Machines that share the work.
@@ -49,7 +51,7 @@ def true_world(
     learned = list(map(Surroundings.parse, filter(None, models.split(","))))
     chosen = tuple(PLANNERS) if planners == ALL else tuple(name.strip() for name in planners.split(","))
     surroundings = (TRUTH, GHOST, *RULES, *map(shift_truth, shifts), *learned)
-    config = TrueWorldConfig(data, surroundings, chosen, seed, limit)
+    config = TrueWorldConfig(data, surroundings, chosen, seed, limit, conflict_windows)
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(config.trips))
     table = drive_true_world(config, out, runner)
     episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
