@@ -70,7 +70,7 @@ def test_models_are_named_with_a_temperature():
 
 
 @pytest.mark.parametrize(
-    "limit, wanted, windows",
+    ("limit", "wanted", "windows"),
     [(None, 9, "a0 b0 a1 b1"), (1, 0, "a0"), (1, 1, "a0 b0"), (2, 2, "a0 b0 b1"), (2, 1, "a0 b0"), (2, 9, "a0 b0 b1")],
 )
 def test_conflict_windows_are_added_to_random_ones_until_there_are_enough(limit, wanted, windows, monkeypatch):

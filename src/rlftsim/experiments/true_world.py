@@ -52,7 +52,12 @@ class Episodes:
         """Episodes of some windows."""
         chosen = np.flatnonzero(is_chosen)
         texts = {name: tuple(getattr(self, name)[k] for k in chosen) for name in ("windows", "networks", "conflicts")}
-        return replace(self, **texts, is_random=self.is_random[chosen], values={name: table[..., chosen] for name, table in self.values.items()})
+        return replace(
+            self,
+            **texts,
+            is_random=self.is_random[chosen],
+            values={name: table[..., chosen] for name, table in self.values.items()},
+        )
 
 
 def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
