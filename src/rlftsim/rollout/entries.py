@@ -21,7 +21,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.geometry import wrapped
 from rlftsim.jobs.arrays import read_npz
 from rlftsim.plugins import ExtensionPoint
-from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, Gates, find_region_m
+from rlftsim.rollout.gates import DECISION_STEPS, STANDING_MPS, GateFinder, Gates, find_region_m
 from rlftsim.rollout.types import write_npz
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
 
@@ -29,9 +29,11 @@ REACH_M = 15.0
 """Largest distance of an entrant from the gate that it counts for."""
 FIXED_PER_S = 0.03
 """Entries per second of a gate where traffic drives in, of `fixed-rate`: about 100 vehicles per hour and lane."""
-LEAST_MPS = 0.3
+LEAST_MPS, LEAST_CLOSING_MPS = 0.3, 1.0
 LANE_HALF_WIDTH_M, MOST_TURN_RAD = 1.5, 0.4
 NEWTON_STEPS, RIDGE = 30, 1e-3
+MOST_ENTRANTS = 2000
+"""Entrants that a model keeps, evenly from all logs: more make the draw slower and no better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,8 @@ class Entrants:
     turn_rad: Float[np.ndarray, "K"]
     """Heading minus direction of the lane."""
     speed_mps: Float[np.ndarray, "K"]
+    closing_mps: Float[np.ndarray, "K"]
+    """Speed at which the distance to the ego shrank: who came fast came often, at other gates less so."""
 
     def select(self, index: Int64[np.ndarray, "n"]) -> "Entrants":
         """Some of the entrants."""
@@ -87,7 +91,7 @@ class NoEntries:
             rng: Generator of all choices, not used.
         """
         zeros = np.zeros(len(gates))
-        return Entrants(np.ones(len(gates), np.int64), zeros, zeros, gates.lane_mps)
+        return Entrants(np.ones(len(gates), np.int64), zeros, zeros, gates.lane_mps, gates.lane_closing_mps)
 
 
 class FixedRate(NoEntries):
@@ -100,14 +104,23 @@ class FixedRate(NoEntries):
 
 @dataclass(frozen=True, eq=False)
 class FittedEntries:
-    """Poisson regression on the speeds at which a lane's traffic and standing agents come nearer; entrants of logs."""
+    """Poisson regressions of who moves and who stands, on the speeds at which a lane's traffic and what stands come
+    nearer; entrants of logs.
+    """
 
-    weights: tuple[float, ...]
+    moving: Float[np.ndarray, "4"]
+    """Weights of the inputs for those that move."""
+    standing: Float[np.ndarray, "4"]
+    """Weights for those that stand, as parked cars do."""
     entrants: Entrants
 
     def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
-        """Exponential of the linear predictor."""
-        return np.exp(np.minimum(_describe(gates) @ np.array(self.weights), 0.0))
+        """Exponentials of both linear predictors."""
+        return self._expect_both(gates).sum(-1)
+
+    def _expect_both(self, gates: Gates) -> Float[np.ndarray, "G 2"]:
+        inputs = zip((self.moving, self.standing), _describe(gates))
+        return np.stack([np.exp(np.minimum(values @ weights, 0.0)) for weights, values in inputs], -1)
 
     def draw(self, gates: Gates, rng: np.random.Generator) -> Entrants:
         """Entrants of the logs, each at a gate where it drives in, or stands and is reached by the ego.
@@ -116,18 +129,25 @@ class FittedEntries:
             gates: Gates at which somebody enters.
             rng: Generator of all choices.
         """
-        # speed [G, K] at which each entrant comes nearer at each gate: who enters does, the likelier the faster
+        # speed [G, K] at which each entrant would come nearer at each gate, over that at which it came
         direction, (x, y) = gates.heading[:, None] + self.entrants.turn_rad, gates.inward.T[..., None]
         closing = self.entrants.speed_mps * (np.cos(direction) * x + np.sin(direction) * y)
-        level = np.maximum(closing + gates.standing_closing_mps[:, None], 1e-6).cumsum(1)
+        weight = np.maximum(closing + gates.standing_closing_mps[:, None], 1e-6)
+        weight /= np.maximum(self.entrants.closing_mps, LEAST_CLOSING_MPS)
+        rates, stands = self._expect_both(gates), self.entrants.speed_mps < STANDING_MPS
+        for number, is_chosen in enumerate((~stands, stands)):
+            weight[:, is_chosen] *= rates[:, [number]] / np.maximum(weight[:, is_chosen].sum(1, keepdims=True), 1e-6)
+        level = weight.cumsum(1)
         index = (level < rng.random((len(gates), 1)) * level[:, -1:]).sum(1)
         return self.entrants.select(index)
 
 
-def _describe(gates: Gates) -> Float[np.ndarray, "G 3"]:
-    """Inputs of the regression: 1, and logarithms of both closing speeds."""
+def _describe(gates: Gates) -> tuple[Float[np.ndarray, "G 4"], Float[np.ndarray, "G 4"]]:
+    """Inputs of both regressions: 1, and logarithms of both closing speeds and of the density of those that do so."""
     speeds = np.stack([gates.lane_closing_mps, gates.standing_closing_mps], -1)
-    return np.concatenate([np.ones((len(gates), 1)), np.log(LEAST_MPS + np.maximum(speeds, 0.0))], -1)
+    inputs = np.concatenate([np.ones((len(gates), 1)), np.log(LEAST_MPS + np.maximum(speeds, 0.0))], -1)
+    moving, standing = np.log(gates.moving_per_km[:, None]), np.log(gates.standing_per_km[:, None])
+    return np.concatenate([inputs, moving], -1), np.concatenate([inputs, standing], -1)
 
 
 def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
@@ -149,19 +169,28 @@ def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
             if not len(gates):
                 continue
             gate, entered = log.assign(gates, step)
+            stands = log.speed(entered, step) < STANDING_MPS
             inputs.append(_describe(gates))
-            counts.append(np.bincount(gate, minlength=len(gates)))
+            counts.append(np.stack([np.bincount(gate[chosen], minlength=len(gates)) for chosen in (~stands, stands)], -1))
             rows.append(log.describe(gates, gate, entered, step))
     if not any(len(row.speed_mps) for row in rows):
         raise DataError("nobody enters in these logs: take longer ones, as rlftsim synthesize --seconds 70 makes.")
     entrants = Entrants(*(np.concatenate(values) for values in zip(*(vars(row).values() for row in rows))))
-    x, y = np.concatenate(inputs), np.concatenate(counts)
-    weights = np.array([np.log(y.mean()), 0.0, 0.0])
+    count = len(entrants.speed_mps)
+    entrants = entrants.select(np.linspace(0, count - 1, min(count, MOST_ENTRANTS)).astype(np.int64))
+    moving, standing = (np.concatenate(values) for values in zip(*inputs))
+    y = np.concatenate(counts)
+    return FittedEntries(_fit_poisson(moving, y[:, 0]), _fit_poisson(standing, y[:, 1]), entrants)
+
+
+def _fit_poisson(x: Float[np.ndarray, "n 4"], y: Int64[np.ndarray, "n"]) -> Float[np.ndarray, "4"]:
+    """Weights of the inputs, of which the first is 1, by Newton's method."""
+    weights = np.array([np.log(max(y.mean(), 1e-6)), 0.0, 0.0, 0.0])
     for _ in range(NEWTON_STEPS):
         expected = np.exp(x @ weights)
-        curvature = (x * expected[:, None]).T @ x + RIDGE * np.eye(3)
+        curvature = (x * expected[:, None]).T @ x + RIDGE * np.eye(len(weights))
         weights = weights + np.linalg.solve(curvature, x.T @ (y - expected) - RIDGE * weights)
-    return FittedEntries(tuple(weights.tolist()), entrants)
+    return weights
 
 
 class _LoggedEntries:
@@ -176,27 +205,31 @@ class _LoggedEntries:
         self.distance = np.linalg.norm(self.position - self.position[self.ego], axis=-1)  # [O, S]
 
     def assign(self, gates: Gates, step: int) -> tuple[Int64[np.ndarray, "K"], Int64[np.ndarray, "K"]]:
-        """Gate and track of each agent that is seen half a second later and was beyond the border or not seen."""
+        """Nearest gate and track of each agent that is seen half a second later near the border and was not seen."""
         later = step + DECISION_STEPS
         enters = self.valid[:, later] & ~self.valid[:, step] & (self.distance[:, later] > self.region_m - REACH_M)
         tracks = np.flatnonzero(enters)
         gap = np.linalg.norm(self.position[tracks, None, later] - gates.position, axis=-1)
-        nearest = gap.argmin(1) if len(tracks) else np.zeros(0, np.int64)
-        is_near = gap[np.arange(len(tracks)), nearest] < REACH_M
-        return nearest[is_near], tracks[is_near]
+        return gap.argmin(1) if len(tracks) else np.zeros(0, np.int64), tracks
+
+    def speed(self, tracks: Int64[np.ndarray, "K"], step: int) -> Float[np.ndarray, "K"]:
+        """Speeds half a second later, m/s."""
+        return np.linalg.norm(self.velocity[tracks, step + DECISION_STEPS], axis=-1).astype(float)
 
     def describe(self, gates: Gates, gate: np.ndarray, tracks: np.ndarray, step: int) -> Entrants:
         """Entrants relative to their gates' lanes."""
         later = step + DECISION_STEPS
         offset = self.position[tracks, later] - gates.position[gate]
         normal = np.stack([-np.sin(gates.heading[gate]), np.cos(gates.heading[gate])], -1)
-        speed = np.linalg.norm(self.velocity[tracks, later], axis=-1)
+        speed = self.speed(tracks, step)
         turn = wrapped(self.heading[tracks, later] - gates.heading[gate])
         left = (offset * normal).sum(-1)
         # a vehicle that drives along another lane than the nearest gate's tells nothing of that lane
         is_along = (np.abs(left) < LANE_HALF_WIDTH_M) & (np.abs(turn) < MOST_TURN_RAD)
-        is_described = is_along | (speed < LEAST_MPS) | (self.object_type[tracks] != ObjectType.VEHICLE)
-        entrants = Entrants(self.object_type[tracks], left, turn.astype(float), speed.astype(float))
+        is_described = is_along | (speed < STANDING_MPS) | (self.object_type[tracks] != ObjectType.VEHICLE)
+        is_described &= np.linalg.norm(offset, axis=-1) < REACH_M
+        closing = (self.velocity[tracks, later] * gates.inward[gate]).sum(-1) + gates.standing_closing_mps[gate]
+        entrants = Entrants(self.object_type[tracks], left, turn.astype(float), speed, closing.astype(float))
         return entrants.select(np.flatnonzero(is_described))
 
 
@@ -204,7 +237,10 @@ NO_ENTRIES, FIXED_RATE = NoEntries(), FixedRate()
 ENTRIES: ExtensionPoint[EntryModel] = ExtensionPoint(
     "entry model",
     "rlftsim.entries",
-    {"none": "rlftsim.rollout.entries:NO_ENTRIES", "fixed-rate": "rlftsim.rollout.entries:FIXED_RATE"},
+    {
+        "none": "rlftsim.rollout.entries:NO_ENTRIES", "fixed-rate": "rlftsim.rollout.entries:FIXED_RATE",
+        "fitted": "rlftsim.rollout.fitted_entries:FITTED",
+    },  # fmt: skip
     use=lambda name: load_entries(name),
 )
 """Name -> entry model."""
@@ -244,23 +280,24 @@ def write_entries(path: Path, model: FittedEntries) -> None:
         path: File that `load_entries` reads.
         model: Weights of the regression, and the entrants of the logs.
     """
-    write_npz(path, weights=np.array(model.weights), **vars(model.entrants))
+    write_npz(path, moving=model.moving, standing=model.standing, **vars(model.entrants))
 
 
 def _read_entries(path: str) -> FittedEntries:
-    names, remedy = ("weights", *(column.name for column in fields(Entrants))), "fit it again with rlftsim entries fit"
+    names, remedy = ("moving", "standing", *(column.name for column in fields(Entrants))), "fit it again with rlftsim entries fit"
     try:
         arrays = read_npz(path, names, remedy)
     except FileNotFoundError:
         raise DataError(f"{path}: there is no such file of entries: {remedy}.") from None
     columns = [arrays.get(name) for name in names]
-    lengths = {column.shape for column in columns[1:] if column is not None}
+    lengths = {column.shape for column in columns[2:] if column is not None}
     are_numbers = all(c is not None and c.ndim == 1 and c.dtype.kind in "if" and np.isfinite(c).all() for c in columns)
-    is_right = are_numbers and len(lengths) == 1 and lengths != {(0,)} and arrays["weights"].shape == (3,)
+    is_right = are_numbers and len(lengths) == 1 and lengths != {(0,)} and columns[0].shape == columns[1].shape == (4,)
     if is_right:
         is_right = np.isin(arrays["object_type"], (1, 2, 3)).all() and (arrays["speed_mps"] >= 0).all()
     if not is_right:
         raise DataError(f"{path}: no {', '.join(names)} as finite numbers of equal length in it: {remedy}.")
     # the values of a file may be anything: rates stay below one entry per gate and half second, speeds below 180 km/h
-    weights, *entrants = (column.clip(-50, 50) for column in columns if column is not None)
-    return FittedEntries(tuple(weights.astype(float).tolist()), Entrants(entrants[0].astype(np.int64), *entrants[1:]))
+    moving, standing, *entrants = (column.clip(-50, 50) for column in columns if column is not None)
+    entrants = Entrants(entrants[0].astype(np.int64), *entrants[1:])
+    return FittedEntries(moving.astype(float), standing.astype(float), entrants)

@@ -16,6 +16,8 @@ DECISION_STEPS = 5
 """Agents enter and leave every half second."""
 SPACING_M = 2.0
 NARROWEST_M, WIDEST_M = 60.0, 120.0
+STANDING_MPS = 0.3
+"""Slower agents stand."""
 UNKNOWN_LIMIT_MPS, CRUISE = 10.0, 0.7
 """Speed limit where none is known, and the fraction of the limit that traffic drives."""
 
@@ -37,6 +39,10 @@ class Gates:
     """Speed at which traffic on the lane comes nearer to the ego; negative = goes away."""
     standing_closing_mps: Float[np.ndarray, "G"]
     """Speed at which what stands there comes nearer."""
+    moving_per_km: Float[np.ndarray, "G"]
+    """Agents that move at the current step of the scenario, in the region around the ego and per km of its lanes."""
+    standing_per_km: Float[np.ndarray, "G"]
+    """Agents that stand then."""
 
     def __len__(self) -> int:
         return len(self.heading)
@@ -69,6 +75,19 @@ class GateFinder:
             line[-1, :2] - scenario.origin for line, successors in zip(graph.lines, graph.successors) if not successors
         ]
         self.ends = np.array(ends).reshape(-1, 2)
+        self.moving_per_km, self.standing_per_km = self._count_agents(scenario)
+
+    def _count_agents(self, scenario: Scenario) -> tuple[float, float]:
+        """Agents per km of lanes that move, and that stand, with one more of each, so that no density is zero."""
+        tracks, region_m = scenario.tracks, find_region_m(scenario)
+        position = tracks.position[:, CURRENT_STEP, :2] - scenario.origin
+        ego = position[scenario.ego_index]
+        is_near = tracks.valid[:, CURRENT_STEP] & (np.linalg.norm(position - ego, axis=-1) < region_m)
+        is_near[scenario.ego_index] = False
+        moves = np.linalg.norm(tracks.velocity[:, CURRENT_STEP], axis=-1) >= STANDING_MPS
+        is_inside = np.linalg.norm(self.points - ego, axis=-1) < region_m
+        lanes_km = max(SPACING_M * is_inside.sum() / 1000, 0.1)
+        return (1 + (is_near & moves).sum()) / lanes_km, (1 + (is_near & ~moves).sum()) / lanes_km
 
     def find(self, ego: Float[np.ndarray, "2"], ego_velocity: Float[np.ndarray, "2"], region_m: float) -> Gates:
         """Gates of a region.
@@ -85,9 +104,11 @@ class GateFinder:
         heading, speed = self.heading[index], self.speed[index]
         velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
         standing = -(ego_velocity * inward).sum(-1)
+        moving_per_km, standing_per_km = (np.full(len(index), d) for d in (self.moving_per_km, self.standing_per_km))
         return Gates(
-            index, self.points[index], heading, inward, speed, (velocity * inward).sum(-1) + standing, standing
-        )
+            index, self.points[index], heading, inward, speed, (velocity * inward).sum(-1) + standing, standing,
+            moving_per_km, standing_per_km,
+        )  # fmt: skip
 
     def follow(self, point: int, distance_m: float) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
         """Points of the lanes ahead on every branch, and distances driven to them.

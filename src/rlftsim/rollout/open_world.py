@@ -46,7 +46,7 @@ MOST_TURNED_AWAY = 5
 """Agents that found no room, and for whom others may enter half a second later."""
 CROSSING_S = 2.0
 """Nobody appears whom another agent would meet within this time if both went straight on."""
-LANE_HALF_WIDTH_M = 1.8
+LANE_HALF_WIDTH_M, LANE_WIDTH_M = 1.8, 3.2
 LOOK_M = 80.0
 STRAIGHT_M = np.arange(0.0, LOOK_M, 2.0)
 """Points of the way of those that follow no lane."""
@@ -238,8 +238,9 @@ class OpenWorld:
         is_vehicle = entrants.object_type[k] == ObjectType.VEHICLE
         if is_vehicle and (abs(left) <= PARKED_M or entrants.speed_mps[k] >= PARKED_MPS):
             return lane, float(gates.heading[k]), False
-        # a place to park may be on a lane of this road, then it is the side of the gate's lane
-        for offset in (left, -ROADSIDE_M) if is_vehicle else ():
+        # a place to park may be on a lane of this road, then it is to the right of the gate's lane or of further ones
+        beside = (left, *(-ROADSIDE_M - LANE_WIDTH_M * lanes for lanes in range(3)))
+        for offset in beside if is_vehicle else ():
             is_on_lane = np.linalg.norm(self.finder.points - (lane + offset * side), axis=-1) < OFF_LANES_M
             if not is_on_lane.any():  # cars pass it
                 return lane + offset * side, float(gates.heading[k]) + turn, True
