@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.warm_start import lead_ego
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import (
     HISTORY_STEPS,
@@ -163,6 +164,7 @@ def evaluate_windows(
     seed: int = 0,
     sampling: Sampling = Sampling(),  # noqa: B008
     entries: str | None = None,
+    ego: Literal["model", "log"] = "model",
     rollouts_per_pass: int = 8,
     out: Path | None = None,
 ) -> WindowEvaluation:
@@ -177,6 +179,7 @@ def evaluate_windows(
         seed: Seed of the rollouts.
         sampling: Temperature and truncation of the decisions.
         entries: Name or file of the model of who enters; None = nobody enters or leaves.
+        ego: Who moves the ego. Around the logged one rollouts and log are of the same streets at the same time.
         rollouts_per_pass: Rollouts in memory at once.
         out: Folder of the result; None = in memory alone.
 
@@ -201,7 +204,7 @@ def evaluate_windows(
     identity = {
         "policy": fingerprint_policy(policy), "worlds": hashlib.sha256("".join(scenario_ids).encode()).hexdigest()[:16],
         "rollouts": num_rollouts, "seed": seed, "temperature": sampling.temperature, "top_k": sampling.top_k or "",
-        "entries": identify_entries(entries) or "",
+        "entries": identify_entries(entries) or "", "ego": ego,
     }  # fmt: skip
     path = None if out is None else out / f"{name}.csv"
     if path is not None:
@@ -211,11 +214,12 @@ def evaluate_windows(
             world = scenarios[position]
             scenario = world if entry_model is None else add_visitors(world)
             batch = collate([scenario]).to(get_device(policy))
+            force = lead_ego(batch, policy.steps_per_decision) if ego == "log" else None
             logs.append(measure_windows(read_log(world).steps(slice(num_steps)), world))
             for first in range(0, num_rollouts, rollouts_per_pass):
                 simulated = simulate(
                     policy, batch, num_rollouts=range(first, min(first + rollouts_per_pass, num_rollouts)), seed=seed,
-                    num_steps=num_steps, sampling=sampling, entries=entry_model,
+                    num_steps=num_steps, sampling=sampling, entries=entry_model, force=force,
                 )  # fmt: skip
                 rollouts += [measure_windows(motion, world) for motion in read_rollouts(scenario, simulated)]
             advance()

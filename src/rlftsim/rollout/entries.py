@@ -171,7 +171,9 @@ def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
             gate, entered = log.assign(gates, step)
             stands = log.speed(entered, step) < STANDING_MPS
             inputs.append(_describe(gates))
-            counts.append(np.stack([np.bincount(gate[chosen], minlength=len(gates)) for chosen in (~stands, stands)], -1))
+            counts.append(
+                np.stack([np.bincount(gate[chosen], minlength=len(gates)) for chosen in (~stands, stands)], -1)
+            )
             rows.append(log.describe(gates, gate, entered, step))
     if not any(len(row.speed_mps) for row in rows):
         raise DataError("nobody enters in these logs: take longer ones, as rlftsim synthesize --seconds 70 makes.")
@@ -238,9 +240,10 @@ ENTRIES: ExtensionPoint[EntryModel] = ExtensionPoint(
     "entry model",
     "rlftsim.entries",
     {
-        "none": "rlftsim.rollout.entries:NO_ENTRIES", "fixed-rate": "rlftsim.rollout.entries:FIXED_RATE",
+        "none": "rlftsim.rollout.entries:NO_ENTRIES",
+        "fixed-rate": "rlftsim.rollout.entries:FIXED_RATE",
         "fitted": "rlftsim.rollout.fitted_entries:FITTED",
-    },  # fmt: skip
+    },
     use=lambda name: load_entries(name),
 )
 """Name -> entry model."""
@@ -284,7 +287,8 @@ def write_entries(path: Path, model: FittedEntries) -> None:
 
 
 def _read_entries(path: str) -> FittedEntries:
-    names, remedy = ("moving", "standing", *(column.name for column in fields(Entrants))), "fit it again with rlftsim entries fit"
+    weights, remedy = ("moving", "standing"), "fit it again with rlftsim entries fit"
+    names = (*weights, *(column.name for column in fields(Entrants)))
     try:
         arrays = read_npz(path, names, remedy)
     except FileNotFoundError:
@@ -292,7 +296,8 @@ def _read_entries(path: str) -> FittedEntries:
     columns = [arrays.get(name) for name in names]
     lengths = {column.shape for column in columns[2:] if column is not None}
     are_numbers = all(c is not None and c.ndim == 1 and c.dtype.kind in "if" and np.isfinite(c).all() for c in columns)
-    is_right = are_numbers and len(lengths) == 1 and lengths != {(0,)} and columns[0].shape == columns[1].shape == (4,)
+    is_right = are_numbers and len(lengths) == 1 and lengths != {(0,)}
+    is_right = is_right and all(arrays[name].shape == (4,) for name in weights)
     if is_right:
         is_right = np.isin(arrays["object_type"], (1, 2, 3)).all() and (arrays["speed_mps"] >= 0).all()
     if not is_right:

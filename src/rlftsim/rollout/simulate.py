@@ -59,7 +59,7 @@ def simulate(
         force: Function called before every advance with the state and the step that the decision starts at; may impose
             states on agents.
         entries: Model of who enters, for a single scenario with visitors (`open_world.add_visitors`); agents leave,
-            too. Takes the place of `force`. None = nobody enters or leaves.
+            too; `force` has the last word. None = nobody enters or leaves.
         observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error ends
             the simulation.
         may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
@@ -86,7 +86,6 @@ def simulate(
             f"goals are due after {FUTURE_STEPS} steps, not after {num_steps}: simulate 8 seconds, or leave goals out."
         )
     world = None if entries is None else OpenRollouts(batch, rollout_ids, seed, stride, entries)
-    force = force if world is None else world.force
     goals = goals and goals.repeat(len(rollout_ids))
 
     # 1. noise depends on seed, scenario and rollout id alone
@@ -104,6 +103,7 @@ def simulate(
         arguments = (sampling, decision_noise)
         decision = choose(distribution, state, *arguments) if choose else distribution.sample(*arguments)
         forced = force(state, step) if force else None
+        forced = forced if world is None else world.force(state, step).overlay(forced)
         state = policy.advance(context, state, decision, forced)
         poses.append(read_poses(policy, state, shape))
         decisions.append(decision)

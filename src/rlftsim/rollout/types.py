@@ -46,6 +46,17 @@ class AgentStates:
         """
         return AgentStates(*(values[:, :, :, start:stop] for values in vars(self).values()))
 
+    def overlay(self, states: "AgentStates | None") -> "AgentStates":
+        """These states, and others in their place where those are imposed.
+
+        Args:
+            states: States of the same agents and steps, also of a single rollout for all of them; None = none.
+        """
+        if states is None:
+            return self
+        position = torch.where(states.valid[..., None], states.position, self.position)
+        return AgentStates(position, torch.where(states.valid, states.heading, self.heading), self.valid | states.valid)
+
     def rollouts(self, selected: slice) -> "AgentStates":
         """The states of some of the rollouts."""
         return AgentStates(*(values[:, selected] for values in vars(self).values()))

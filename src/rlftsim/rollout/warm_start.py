@@ -101,7 +101,7 @@ def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) 
             batch = collate([window]).to(get_device(policy))
             rollout = simulate(
                 policy, batch, num_rollouts=1, seed=derive_seed(seed, step), num_steps=HOP_STEPS,
-                force=_lead_ego(batch, policy.steps_per_decision),
+                force=lead_ego(batch, policy.steps_per_decision),
             )  # fmt: skip
             is_other = window.simulated_indices != scenario.ego_index  # [A]
             rows = window.simulated_indices[is_other]
@@ -117,8 +117,13 @@ def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) 
     return starts
 
 
-def _lead_ego(batch: ScenarioBatch, stride: int) -> Force:
-    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego."""
+def lead_ego(batch: ScenarioBatch, stride: int) -> Force:
+    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego.
+
+    Args:
+        batch: A single scenario.
+        stride: Steps of a decision.
+    """
     scenario = batch.scenarios[0]
     is_ego = batch.object_id == int(scenario.tracks.object_id[scenario.ego_index])  # [1, A]
 

@@ -36,7 +36,8 @@ def evaluate(
 @overload
 def evaluate(
     policy: Model, data: Data, *, name: str | None = ..., out: File | None = ..., num_rollouts: int = ...,
-    seed: int = ..., seconds: float, entries: str | None = ..., limit: int | None = ...,
+    seed: int = ..., seconds: float, entries: str | None = ..., ego: Literal["model", "log"] = ...,
+    limit: int | None = ...,
     sampling: Sampling | None = ..., split: str | None = ..., device: Device = ...,
 ) -> WindowEvaluation: ...  # fmt: skip
 @with_checked_arguments
@@ -50,6 +51,7 @@ def evaluate(
     seed: int = 0,
     seconds: float | None = None,
     entries: str | None = None,
+    ego: Literal["model", "log"] = "model",
     limit: int | None = None,
     metric: Metric = "2025",
     sampling: Sampling | None = None,
@@ -80,6 +82,7 @@ def evaluate(
         seconds: Length of long rollouts, a multiple of 10, of worlds whose logs are as long (`rlftsim synthesize
             --seconds 70`); left out, the 8 seconds of the metric.
         entries: Who enters a long world, as in `rlftsim simulate`; left out, nobody enters or leaves.
+        ego: Who moves the ego of a long world: around the logged one rollouts and log are of the same streets.
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
         metric: Year of the meta-metric, or "2025-scenario-gen" for the challenge in which whole scenes are made: agents
             but the ego begin at states drawn from the lanes, see docs/scenario_generation.md.
@@ -111,8 +114,9 @@ def evaluate(
         raise ConfigError(f"--guidance-scale {guidance_scale:g} has no effect without goals: add --goals logged.")
     if seconds is not None:
         check_left_out(evaluate, locals(), BY_METRIC, "has no effect on long rollouts: leave it out, or seconds.")
-    elif entries is not None:
-        raise ConfigError("entries has no effect on the 8 s of the metric: name the seconds, or leave it out.")
+    elif entries is not None or ego != "model":
+        name = "ego" if entries is None else "entries"
+        raise ConfigError(f"{name} has no effect on the 8 s of the metric: name the seconds, or leave it out.")
     # 2. The policy and its name.
     if isinstance(policy, str | os.PathLike):
         name = name or evaluation.evaluation_name(pin_model(policy))
@@ -126,7 +130,7 @@ def evaluate(
             raise ConfigError("the oracle has no long rollouts: the log is in every table, name a model.")
         return evaluate_windows(
             frozen_copy(model), to_scenarios(data, split, limit), seconds=seconds, name=name,
-            num_rollouts=num_rollouts, seed=seed, sampling=sampling, entries=entries,
+            num_rollouts=num_rollouts, seed=seed, sampling=sampling, entries=entries, ego=ego,
             rollouts_per_pass=rollouts_per_pass, out=None if out is None else Path(out),
         )  # fmt: skip
     # 3. Scores.
