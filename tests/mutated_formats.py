@@ -284,7 +284,7 @@ def make_catk(folder: Path) -> None:
 
 def make_entries(folder: Path) -> None:
     left, turn, speed, closing = (np.array(pair) for pair in ((0.0, 2.0), (0.0, 3.0), (9.0, 0.1), (8.0, 2.0)))
-    moving, standing = np.array([-4.0, 0.3, 0.5, 0.2]), np.array([-5.0, 0.0, 1.0, 0.3])
+    moving, standing = np.array([-4.0, 0.5, 0.2]), np.array([-5.0, 1.0, 0.3])
     write_entries(
         folder / "entries.npz",
         FittedEntries(moving, standing, Entrants(np.array([1, 2]), left, turn, speed, closing)),

@@ -19,6 +19,7 @@ from rlftsim.rollout.gates import GateFinder
 from rlftsim.rollout.open_world import EGO_GAP_M, VISITORS, add_visitors, find_safe_speed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates
+from rlftsim.rollout.warm_start import lead_ego
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.scenario.polylines import arc_length, resample_to
@@ -159,6 +160,62 @@ def test_fitted_entries_expect_what_the_log_had(tmp_path):
     (tmp_path / "entries.npz").write_bytes(b"PK")
     with pytest.raises(DataError, match="rlftsim entries fit"):
         load_entries(str(tmp_path / "entries.npz"))
+
+
+def parked_log(ego_mps):
+    """A log in which cars parked every 20 m beside the road become visible 60 m ahead of the ego."""
+    road = scenes.straight_road()
+    steps = 300
+    tracks = road.tracks.select(np.repeat(road.ego_index, 40))
+    still = {
+        name: np.repeat(getattr(tracks, name)[:, 10:11], steps, 1)
+        for name in ("position", "heading", "velocity", "size")
+    }
+    tracks = replace(tracks, **still, valid=np.zeros((40, steps), bool), object_id=np.arange(40))
+    ego = tracks.position[0, 0].copy()
+    tracks.position[0, :, 0] += ego_mps * 0.1 * np.arange(steps)
+    tracks.velocity[:] = 0.0
+    tracks.velocity[0, :, 0] = ego_mps
+    tracks.valid[0] = True
+    for car in range(1, 40):
+        tracks.position[car] = ego + (20.0 * car, -3.5, 0.0)
+        tracks.valid[car] = np.abs(tracks.position[car, 0, 0] - tracks.position[0, :, 0]) < 60.0
+    return replace(
+        road, tracks=tracks, timestamps_s=np.round(np.arange(steps) * 0.1, 1), ego_index=0,
+        tracks_to_predict=np.zeros(0, np.int32), difficulty=np.zeros(0, np.int8),
+    )  # fmt: skip
+
+
+def test_parked_cars_enter_as_fast_as_the_ego_comes_and_none_where_it_stands():
+    model = fit_entries([parked_log(speed) for speed in (0.0, 2.0, 4.0, 8.0)] * 8)
+    finder, ego = GateFinder(parked_log(8.0)), np.zeros(2)
+    rates = [model.expect(finder.find(ego, np.array([speed, 0.0]), 60.0)).sum() for speed in (0.0, 4.0, 8.0)]
+    assert rates[0] < 0.3 * rates[1]
+    assert rates[2] * 2 == pytest.approx(8.0 / 20.0, rel=0.3)  # per second
+    gates = finder.find(ego, np.array([8.0, 0.0]), 60.0)
+    entrants = model.draw(gates.select(np.flatnonzero(gates.position[:, 0] > 0)), np.random.default_rng(0))
+    assert (entrants.speed_mps < 0.1).all()
+    assert (np.abs(entrants.left_m) > 1.8).all()
+
+
+def test_a_scene_with_more_agents_now_expects_more_to_enter():
+    model = load_entries("fitted")
+    gates = GateFinder(scenes.straight_road()).find(np.zeros(2), np.array([5.0, 0.0]), 60.0)
+    denser = replace(gates, moving_per_km=4 * gates.moving_per_km, standing_per_km=4 * gates.standing_per_km)
+    assert model.expect(denser).sum() > 1.2 * model.expect(gates).sum()
+
+
+def test_an_ego_that_is_led_follows_the_log_while_others_enter(scenario):
+    batch = collate([add_visitors(scenario)])
+    policy = load_policy("demo-base")
+    rollouts = simulate(
+        policy, batch, num_rollouts=2, seed=0, entries=load_entries("fitted"),
+        force=lead_ego(batch, policy.steps_per_decision),
+    )  # fmt: skip
+    ego = int(np.flatnonzero(scenario.simulated_indices == scenario.ego_index)[0])
+    logged = scenario.tracks.position[scenario.ego_index, 11:, :2] - scenario.origin
+    assert np.allclose(rollouts.position[0, :, ego].numpy(), logged, atol=1e-3)
+    assert rollouts.valid[0, :, len(scenario.simulated_indices) :].any()
 
 
 def test_what_does_not_fit_is_refused_in_one_line(scenario):

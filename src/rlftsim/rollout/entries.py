@@ -31,7 +31,9 @@ FIXED_PER_S = 0.03
 """Entries per second of a gate where traffic drives in, of `fixed-rate`: about 100 vehicles per hour and lane."""
 LEAST_MPS, LEAST_CLOSING_MPS = 0.3, 1.0
 LANE_HALF_WIDTH_M, MOST_TURN_RAD = 1.5, 0.4
-NEWTON_STEPS, RIDGE = 30, 1e-3
+NEWTON_STEPS = 30
+RIDGE = np.diag([1e-3, 2.0, 2.0])
+"""Counts of entries that weigh as much as the prior that a weight is 0: a few logs say little of their densities."""
 MOST_ENTRANTS = 2000
 """Entrants that a model keeps, evenly from all logs: more make the draw slower and no better."""
 
@@ -104,13 +106,13 @@ class FixedRate(NoEntries):
 
 @dataclass(frozen=True, eq=False)
 class FittedEntries:
-    """Poisson regressions of who moves and who stands, on the speeds at which a lane's traffic and what stands come
-    nearer; entrants of logs.
+    """Poisson regressions of who moves and who stands, on the speed at which a lane's traffic and what stands come
+    nearer and on how many of these there are now; entrants of logs.
     """
 
-    moving: Float[np.ndarray, "4"]
+    moving: Float[np.ndarray, "3"]
     """Weights of the inputs for those that move."""
-    standing: Float[np.ndarray, "4"]
+    standing: Float[np.ndarray, "3"]
     """Weights for those that stand, as parked cars do."""
     entrants: Entrants
 
@@ -142,12 +144,14 @@ class FittedEntries:
         return self.entrants.select(index)
 
 
-def _describe(gates: Gates) -> tuple[Float[np.ndarray, "G 4"], Float[np.ndarray, "G 4"]]:
-    """Inputs of both regressions: 1, and logarithms of both closing speeds and of the density of those that do so."""
-    speeds = np.stack([gates.lane_closing_mps, gates.standing_closing_mps], -1)
-    inputs = np.concatenate([np.ones((len(gates), 1)), np.log(LEAST_MPS + np.maximum(speeds, 0.0))], -1)
-    moving, standing = np.log(gates.moving_per_km[:, None]), np.log(gates.standing_per_km[:, None])
-    return np.concatenate([inputs, moving], -1), np.concatenate([inputs, standing], -1)
+def _describe(gates: Gates) -> list[Float[np.ndarray, "G 3"]]:
+    """Inputs of both regressions: 1, and logarithms of the closing speed and of the density."""
+    return [
+        np.stack([np.ones(len(gates)), np.log(LEAST_MPS + np.maximum(closing_mps, 0.0)), np.log(per_km)], -1)
+        for closing_mps, per_km in (
+            (gates.lane_closing_mps, gates.moving_per_km), (gates.standing_closing_mps, gates.standing_per_km)
+        )
+    ]  # fmt: skip
 
 
 def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
@@ -185,13 +189,13 @@ def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
     return FittedEntries(_fit_poisson(moving, y[:, 0]), _fit_poisson(standing, y[:, 1]), entrants)
 
 
-def _fit_poisson(x: Float[np.ndarray, "n 4"], y: Int64[np.ndarray, "n"]) -> Float[np.ndarray, "4"]:
+def _fit_poisson(x: Float[np.ndarray, "n 3"], y: Int64[np.ndarray, "n"]) -> Float[np.ndarray, "3"]:
     """Weights of the inputs, of which the first is 1, by Newton's method."""
-    weights = np.array([np.log(max(y.mean(), 1e-6)), 0.0, 0.0, 0.0])
+    weights = np.array([np.log(max(y.mean(), 1e-6)), 0.0, 0.0])
     for _ in range(NEWTON_STEPS):
         expected = np.exp(x @ weights)
-        curvature = (x * expected[:, None]).T @ x + RIDGE * np.eye(len(weights))
-        weights = weights + np.linalg.solve(curvature, x.T @ (y - expected) - RIDGE * weights)
+        curvature = (x * expected[:, None]).T @ x + RIDGE
+        weights = weights + np.linalg.solve(curvature, x.T @ (y - expected) - RIDGE @ weights)
     return weights
 
 
@@ -297,7 +301,7 @@ def _read_entries(path: str) -> FittedEntries:
     lengths = {column.shape for column in columns[2:] if column is not None}
     are_numbers = all(c is not None and c.ndim == 1 and c.dtype.kind in "if" and np.isfinite(c).all() for c in columns)
     is_right = are_numbers and len(lengths) == 1 and lengths != {(0,)}
-    is_right = is_right and all(arrays[name].shape == (4,) for name in weights)
+    is_right = is_right and all(arrays[name].shape == (3,) for name in weights)
     if is_right:
         is_right = np.isin(arrays["object_type"], (1, 2, 3)).all() and (arrays["speed_mps"] >= 0).all()
     if not is_right:
