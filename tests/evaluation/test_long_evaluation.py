@@ -111,7 +111,8 @@ def test_what_cannot_be_held_against_the_log_is_refused_in_one_line(long_road, t
     for settings, reason in (
         ({"seconds": 15.0}, "windows last 10 s"),
         ({"seconds": 10.0, "jobs": 2}, "jobs has no effect on long rollouts"),
-        ({"entries": "none"}, "name the seconds"),
+        ({"entries": "none"}, "entries has no effect on 8 s: leave it out, or name the seconds"),
+        ({"ego": "log"}, "ego has no effect on 8 s"),
     ):
         with pytest.raises(ConfigError, match=reason):
             rs.evaluate("constant_velocity", [long_road], **settings)

@@ -17,9 +17,8 @@ from rlftsim.rollout.edge_scenes import edge_scenes, without_future
 from rlftsim.rollout.entries import FittedEntries, fit_entries, load_entries, write_entries
 from rlftsim.rollout.gates import GateFinder
 from rlftsim.rollout.open_world import EGO_GAP_M, VISITORS, add_visitors, find_safe_speed
-from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.simulate import lead_ego, simulate
 from rlftsim.rollout.types import AgentStates
-from rlftsim.rollout.warm_start import lead_ego
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.scenario.polylines import arc_length, resample_to

@@ -26,8 +26,7 @@ from rlftsim.rollout.entries import identify_entries, load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.open_world import add_visitors
 from rlftsim.rollout.policy import Policy, Sampling, get_device
-from rlftsim.rollout.simulate import simulate
-from rlftsim.rollout.warm_start import lead_ego
+from rlftsim.rollout.simulate import lead_ego, simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import (
     HISTORY_STEPS,

@@ -246,7 +246,7 @@ ENTRIES: ExtensionPoint[EntryModel] = ExtensionPoint(
     {
         "none": "rlftsim.rollout.entries:NO_ENTRIES",
         "fixed-rate": "rlftsim.rollout.entries:FIXED_RATE",
-        "fitted": "rlftsim.rollout.fitted_entries:FITTED",
+        "fitted": "rlftsim.rollout.entries:FITTED",
     },
     use=lambda name: load_entries(name),
 )
@@ -310,3 +310,12 @@ def _read_entries(path: str) -> FittedEntries:
     moving, standing, *entrants = (column.clip(-50, 50) for column in columns if column is not None)
     entrants = Entrants(entrants[0].astype(np.int64), *entrants[1:])
     return FittedEntries(moving.astype(float), standing.astype(float), entrants)
+
+
+FITTED = _read_entries(str(Path(__file__).with_name("fitted_entries.npz")))
+"""Fitted to 120 long logs of 24 synthetic street networks:
+
+python -c 'from rlftsim.scenario.synthetic.generate import generate; generate("FIT", num_scenarios=120,
+    seed=(1 << 48) + 20261130, num_steps=711, splits={"training": 1.0}, scenarios_per_network=5)'
+rlftsim entries fit FIT src/rlftsim/rollout/fitted_entries.npz
+"""

@@ -18,7 +18,7 @@ from rlftsim.rollout.open_world import OpenRollouts
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, Scenarios
+from rlftsim.scenario.types import FUTURE_STEPS, HISTORY_STEPS, STEP_S, Scenarios
 
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]
@@ -154,6 +154,24 @@ def _draw_decision_noise(
         purpose, per_agent = name_decisions(block), per_block * policy.noise_size
         noise = draw_noise(batch, rollout_ids, seed=seed, purpose=purpose, per_agent=per_agent)
         yield from noise.unflatten(-1, (per_block, -1)).unbind(-2)
+
+
+def lead_ego(batch: ScenarioBatch, stride: int) -> Force:
+    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego.
+
+    Args:
+        batch: A single scenario.
+        stride: Steps of a decision.
+    """
+    scenario = batch.scenarios[0]
+    is_ego = batch.object_id == int(scenario.tracks.object_id[scenario.ego_index])  # [1, A]
+
+    def force(_: object, step: int) -> AgentStates:
+        steps = slice(HISTORY_STEPS + step, HISTORY_STEPS + step + stride)
+        valid = batch.valid[..., steps] & is_ego[..., None]
+        return AgentStates(batch.position[:, None, :, steps], batch.heading[:, None, :, steps], valid[:, None])
+
+    return force
 
 
 def check_length(policy: Policy, num_steps: int) -> None:

@@ -14,9 +14,8 @@ from rlftsim.geometry import boxes_overlap
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Policy, get_device
-from rlftsim.rollout.simulate import Force, simulate
-from rlftsim.rollout.types import AgentStates
-from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.rollout.simulate import lead_ego, simulate
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     FUTURE_STEPS,
@@ -115,24 +114,6 @@ def _drive(policy: Policy, scenario: Scenario, steps: Sequence[int], seed: int) 
             tracks.valid[rows, future] = True
             _join_and_leave(tracks, log, rows, scenario.ego_index, now + HOP_STEPS)
     return starts
-
-
-def lead_ego(batch: ScenarioBatch, stride: int) -> Force:
-    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego.
-
-    Args:
-        batch: A single scenario.
-        stride: Steps of a decision.
-    """
-    scenario = batch.scenarios[0]
-    is_ego = batch.object_id == int(scenario.tracks.object_id[scenario.ego_index])  # [1, A]
-
-    def force(_: object, step: int) -> AgentStates:
-        steps = slice(HISTORY_STEPS + step, HISTORY_STEPS + step + stride)
-        valid = batch.valid[..., steps] & is_ego[..., None]
-        return AgentStates(batch.position[:, None, :, steps], batch.heading[:, None, :, steps], valid[:, None])
-
-    return force
 
 
 def _copy(tracks: Tracks) -> Tracks:

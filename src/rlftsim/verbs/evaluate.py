@@ -22,8 +22,10 @@ from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
 from rlftsim.verbs.inputs import check_left_out, find_policy_name, to_policy, to_sampling, with_checked_arguments
 
-BY_METRIC = ("metric", "goals", "jobs", "guidance_scale", "work")
-"""Arguments without effect on rollouts of another length, which are held against the log by windows."""
+BY_METRIC, LONG = ("metric", "goals", "jobs", "guidance_scale", "work"), ("entries", "ego")
+"""Arguments without effect on rollouts of another length, which are held against the log by windows; and on those of
+8 s.
+"""
 
 
 @overload
@@ -114,9 +116,8 @@ def evaluate(
         raise ConfigError(f"--guidance-scale {guidance_scale:g} has no effect without goals: add --goals logged.")
     if seconds is not None:
         check_left_out(evaluate, locals(), BY_METRIC, "has no effect on long rollouts: leave it out, or seconds.")
-    elif entries is not None or ego != "model":
-        name = "ego" if entries is None else "entries"
-        raise ConfigError(f"{name} has no effect on the 8 s of the metric: name the seconds, or leave it out.")
+    else:
+        check_left_out(evaluate, locals(), LONG, "has no effect on 8 s: leave it out, or name the seconds.")
     # 2. The policy and its name.
     if isinstance(policy, str | os.PathLike):
         name = name or evaluation.evaluation_name(pin_model(policy))
