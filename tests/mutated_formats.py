@@ -287,7 +287,7 @@ def make_entries(folder: Path) -> None:
     moving, standing = np.array([-4.0, 0.5, 0.2]), np.array([-5.0, 1.0, 0.3])
     write_entries(
         folder / "entries.npz",
-        FittedEntries(moving, standing, Entrants(np.array([1, 2]), left, turn, speed, closing)),
+        FittedEntries(moving, standing, Entrants(np.array([1, 2]), left, turn, speed), closing),
     )
 
 

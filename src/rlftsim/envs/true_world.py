@@ -124,7 +124,8 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     names = [trip.name for trip in trips]
     format = ScenarioValues(out / "episodes", names, identity, read_row)
     rows = measure_scenarios("episodes", partial(_drive_trip, trips), format, runner=runner)
-    table = pa.Table.from_pylist(rows)
+    # a window is random or chosen by this call's settings, and the files serve others, too
+    table = pa.Table.from_pylist([{**row, "is_random": trip.is_random} for row, trip in zip(rows, trips, strict=True)])
     write_atomically(out / ROWS, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
     return table
 

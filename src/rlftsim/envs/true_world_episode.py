@@ -97,7 +97,7 @@ class Trip:
         settings = tuple(sorted(read_action_settings(planner).items()))
         env = _make_environment(self.data, self.window, self.surroundings, settings)
         row: dict[str, object] = {
-            "network": self.network, "window": self.window, "is_random": self.is_random,
+            "network": self.network, "window": self.window,
             "conflicts": " ".join(sorted(list_conflicts(self.data, self.window))), "planner": self.planner,
             "traffic": self.surroundings.name, "rollout": 0,
         }  # fmt: skip
@@ -130,7 +130,7 @@ def read_row(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     row = values["row"]
     numbers = {column: float(row[column]) for column in (*SCORES, *COUNTS)}
     texts = {column: str(row[column]) for column in TEXTS}
-    return {**texts, "is_random": bool(row["is_random"]), "rollout": int(row["rollout"]), **numbers}
+    return {**texts, "rollout": int(row["rollout"]), **numbers}
 
 
 class _WorldSource(Source):

@@ -8,7 +8,7 @@ import hashlib
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.drift import find_lane_points
 from rlftsim.evaluation.incidents import Incidents, find_incidents
 from rlftsim.evaluation.motion import MOVING_MPS, STRIDE, Motion, find_collisions, measure_gaps, read_log, read_rollouts
 from rlftsim.evaluation.resumable import check_same_work
@@ -39,6 +40,8 @@ from rlftsim.scenario.types import (
 
 WINDOW_STEPS = 100
 NEAR_M = 60.0
+OFF_MAP_M = 30.0
+"""An ego so far from every lane has left the map, as in an environment."""
 LONGEST_GAP_M = 60.0
 HEADINGS = (
     "world", "seconds", "agents within 60 m", "that move", "speed of these [m/s]", "W1 of speed [m/s]", "W1 of gap [m]",
@@ -73,6 +76,9 @@ class WindowSamples:
     """Agents that appear, in each world."""
     agent_minutes: Float[np.ndarray, "_"]
     """In each world."""
+
+
+NO_SAMPLES = WindowSamples(*(np.zeros(0) for _ in fields(WindowSamples)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -130,6 +136,7 @@ def _summarize(samples: WindowSamples, log: WindowSamples) -> dict[str, float]:
     return {
         "agents_within_60_m": means["density"], "moving": means["driving"], "speed_mps": means["speed"],
         "w1_speed_mps": compute_distance(samples.speed, log.speed), "w1_gap_m": compute_distance(samples.gap, log.gap),
+        "num_worlds": len(samples.entries),
         "ego_speed_mps": means["ego_speed"], "entries_per_min": 6 * means["entries"],
         "collisions_per_agent_min": rate(samples.collisions),
         "road_departures_per_agent_min": rate(samples.departures),
@@ -191,7 +198,15 @@ def evaluate_windows(
     num_steps = count_steps(seconds)
     if num_steps % WINDOW_STEPS:
         raise ConfigError(f"seconds={seconds:g}: windows last 10 s: take a multiple, or leave it out for the 8 s.")
+    if ego not in ("model", "log"):
+        raise ConfigError(f"ego={ego!r}: expected 'model' or 'log'.")
     for scenario in (scenarios[position] for position in range(len(scenarios))):
+        is_logged = scenario.tracks.valid[scenario.ego_index, HISTORY_STEPS : HISTORY_STEPS + num_steps]
+        if ego == "log" and not is_logged.all():
+            raise DataError(
+                f"scenario {scenario.scenario_id}: its log lacks the ego {(is_logged.argmin() + 1) * STEP_S:.1f} s "
+                "after now: leave out ego='log', or the scenario."
+            )
         left = scenario.num_steps - HISTORY_STEPS
         if left < num_steps:
             raise DataError(
@@ -232,7 +247,7 @@ def evaluate_windows(
 
 
 def measure_windows(motion: Motion, scenario: Scenario) -> list[WindowSamples]:
-    """Samples of each 10 s of a world.
+    """Samples of each 10 s of a world; none from that one on in which the ego drives off the map.
 
     Args:
         motion: Motion of all agents; what is left behind the last 10 s does not count.
@@ -240,13 +255,24 @@ def measure_windows(motion: Motion, scenario: Scenario) -> list[WindowSamples]:
     """
     num_windows, num_samples = motion.heading.shape[1] // WINDOW_STEPS, WINDOW_STEPS // STRIDE
     incidents = find_incidents(motion.steps(slice(num_windows * WINDOW_STEPS)), scenario)
-    return [
+    on_map = _count_steps_on_map(motion, scenario) // WINDOW_STEPS
+    measured = [
         _measure(
             motion.steps(slice(k * WINDOW_STEPS, (k + 1) * WINDOW_STEPS)),
             incidents.samples(slice(k * num_samples, (k + 1) * num_samples)),
         )
-        for k in range(num_windows)
+        for k in range(min(num_windows, on_map))
     ]
+    return measured + [NO_SAMPLES] * (num_windows - len(measured))
+
+
+def _count_steps_on_map(motion: Motion, scenario: Scenario) -> int:
+    """Steps until no lane is near the ego; all of them on a map without lanes."""
+    lanes, ego = find_lane_points(scenario), motion.position[motion.ego, ::STRIDE]
+    if lanes is None:
+        return motion.heading.shape[1]
+    is_off = lanes.tree.query(ego + scenario.origin)[0] > OFF_MAP_M
+    return int(is_off.argmax()) * STRIDE if is_off.any() else motion.heading.shape[1]
 
 
 def join_samples(samples: Sequence[WindowSamples]) -> WindowSamples:

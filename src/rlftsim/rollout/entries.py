@@ -25,8 +25,17 @@ from rlftsim.rollout.gates import DECISION_STEPS, STANDING_MPS, GateFinder, Gate
 from rlftsim.rollout.types import write_npz
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
 
-REACH_M = 15.0
-"""Largest distance of an entrant from the gate that it counts for."""
+SHIPPED = Path(__file__).with_name("fitted_entries.npz")
+"""Model "fitted", of 120 long logs of 24 synthetic street networks:
+
+python -c 'from rlftsim.scenario.synthetic.generate import generate; generate("FIT", num_scenarios=120,
+    seed=(1 << 48) + 20261130, num_steps=711, splits={"training": 1.0}, scenarios_per_network=5)'
+rlftsim entries fit FIT src/rlftsim/rollout/fitted_entries.npz
+"""
+REACH_M, BEYOND_M = 15.0, 30.0
+"""Who becomes visible so little inside of the border or so little outside enters; the first is also the largest
+distance from the gate at which an entrant says where others enter.
+"""
 FIXED_PER_S = 0.03
 """Entries per second of a gate where traffic drives in, of `fixed-rate`: about 100 vehicles per hour and lane."""
 LEAST_MPS, LEAST_CLOSING_MPS = 0.3, 1.0
@@ -48,8 +57,6 @@ class Entrants:
     turn_rad: Float[np.ndarray, "K"]
     """Heading minus direction of the lane."""
     speed_mps: Float[np.ndarray, "K"]
-    closing_mps: Float[np.ndarray, "K"]
-    """Speed at which the distance to the ego shrank: who came fast came often, at other gates less so."""
 
     def select(self, index: Int64[np.ndarray, "n"]) -> "Entrants":
         """Some of the entrants."""
@@ -93,7 +100,7 @@ class NoEntries:
             rng: Generator of all choices, not used.
         """
         zeros = np.zeros(len(gates))
-        return Entrants(np.ones(len(gates), np.int64), zeros, zeros, gates.lane_mps, gates.lane_closing_mps)
+        return Entrants(np.ones(len(gates), np.int64), zeros, zeros, gates.lane_mps)
 
 
 class FixedRate(NoEntries):
@@ -115,6 +122,8 @@ class FittedEntries:
     standing: Float[np.ndarray, "3"]
     """Weights for those that stand, as parked cars do."""
     entrants: Entrants
+    closing_mps: Float[np.ndarray, "K"]
+    """Speed at which each came nearer to the ego: who came fast came often, at other gates less so."""
 
     def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
         """Exponentials of both linear predictors."""
@@ -122,7 +131,9 @@ class FittedEntries:
 
     def _expect_both(self, gates: Gates) -> Float[np.ndarray, "G 2"]:
         inputs = zip((self.moving, self.standing), _describe(gates))
-        return np.stack([np.exp(np.minimum(values @ weights, 0.0)) for weights, values in inputs], -1)
+        rates = np.stack([np.exp(np.minimum(values @ weights, 0.0)) for weights, values in inputs], -1)
+        stands = self.entrants.speed_mps < STANDING_MPS
+        return rates * [(~stands).any(), stands.any()]  # nobody enters in the place of those that no log describes
 
     def draw(self, gates: Gates, rng: np.random.Generator) -> Entrants:
         """Entrants of the logs, each at a gate where it drives in, or stands and is reached by the ego.
@@ -135,7 +146,7 @@ class FittedEntries:
         direction, (x, y) = gates.heading[:, None] + self.entrants.turn_rad, gates.inward.T[..., None]
         closing = self.entrants.speed_mps * (np.cos(direction) * x + np.sin(direction) * y)
         weight = np.maximum(closing + gates.standing_closing_mps[:, None], 1e-6)
-        weight /= np.maximum(self.entrants.closing_mps, LEAST_CLOSING_MPS)
+        weight /= np.maximum(self.closing_mps, LEAST_CLOSING_MPS)
         rates, stands = self._expect_both(gates), self.entrants.speed_mps < STANDING_MPS
         for number, is_chosen in enumerate((~stands, stands)):
             weight[:, is_chosen] *= rates[:, [number]] / np.maximum(weight[:, is_chosen].sum(1, keepdims=True), 1e-6)
@@ -179,14 +190,16 @@ def fit_entries(scenarios: Sequence[Scenario]) -> FittedEntries:
                 np.stack([np.bincount(gate[chosen], minlength=len(gates)) for chosen in (~stands, stands)], -1)
             )
             rows.append(log.describe(gates, gate, entered, step))
-    if not any(len(row.speed_mps) for row in rows):
+    if not any(len(row.speed_mps) for row, _ in rows):
         raise DataError("nobody enters in these logs: take longer ones, as rlftsim synthesize --seconds 70 makes.")
-    entrants = Entrants(*(np.concatenate(values) for values in zip(*(vars(row).values() for row in rows))))
-    count = len(entrants.speed_mps)
-    entrants = entrants.select(np.linspace(0, count - 1, min(count, MOST_ENTRANTS)).astype(np.int64))
+    entrants = Entrants(*(np.concatenate(values) for values in zip(*(vars(row).values() for row, _ in rows))))
+    closing_mps, count = np.concatenate([closing for _, closing in rows]), len(entrants.speed_mps)
+    kept = np.linspace(0, count - 1, min(count, MOST_ENTRANTS)).astype(np.int64)
     moving, standing = (np.concatenate(values) for values in zip(*inputs))
     y = np.concatenate(counts)
-    return FittedEntries(_fit_poisson(moving, y[:, 0]), _fit_poisson(standing, y[:, 1]), entrants)
+    return FittedEntries(
+        _fit_poisson(moving, y[:, 0]), _fit_poisson(standing, y[:, 1]), entrants.select(kept), closing_mps[kept]
+    )
 
 
 def _fit_poisson(x: Float[np.ndarray, "n 3"], y: Int64[np.ndarray, "n"]) -> Float[np.ndarray, "3"]:
@@ -213,7 +226,8 @@ class _LoggedEntries:
     def assign(self, gates: Gates, step: int) -> tuple[Int64[np.ndarray, "K"], Int64[np.ndarray, "K"]]:
         """Nearest gate and track of each agent that is seen half a second later near the border and was not seen."""
         later = step + DECISION_STEPS
-        enters = self.valid[:, later] & ~self.valid[:, step] & (self.distance[:, later] > self.region_m - REACH_M)
+        outside_m = self.distance[:, later] - self.region_m
+        enters = self.valid[:, later] & ~self.valid[:, step] & (outside_m > -REACH_M) & (outside_m < BEYOND_M)
         tracks = np.flatnonzero(enters)
         gap = np.linalg.norm(self.position[tracks, None, later] - gates.position, axis=-1)
         return gap.argmin(1) if len(tracks) else np.zeros(0, np.int64), tracks
@@ -222,8 +236,8 @@ class _LoggedEntries:
         """Speeds half a second later, m/s."""
         return np.linalg.norm(self.velocity[tracks, step + DECISION_STEPS], axis=-1).astype(float)
 
-    def describe(self, gates: Gates, gate: np.ndarray, tracks: np.ndarray, step: int) -> Entrants:
-        """Entrants relative to their gates' lanes."""
+    def describe(self, gates: Gates, gate: np.ndarray, tracks: np.ndarray, step: int) -> tuple[Entrants, np.ndarray]:
+        """Entrants relative to their gates' lanes, and the speeds at which they come nearer to the ego."""
         later = step + DECISION_STEPS
         offset = self.position[tracks, later] - gates.position[gate]
         normal = np.stack([-np.sin(gates.heading[gate]), np.cos(gates.heading[gate])], -1)
@@ -235,8 +249,9 @@ class _LoggedEntries:
         is_described = is_along | (speed < STANDING_MPS) | (self.object_type[tracks] != ObjectType.VEHICLE)
         is_described &= np.linalg.norm(offset, axis=-1) < REACH_M
         closing = (self.velocity[tracks, later] * gates.inward[gate]).sum(-1) + gates.standing_closing_mps[gate]
-        entrants = Entrants(self.object_type[tracks], left, turn.astype(float), speed, closing.astype(float))
-        return entrants.select(np.flatnonzero(is_described))
+        described = np.flatnonzero(is_described)
+        entrants = Entrants(self.object_type[tracks], left, turn.astype(float), speed)
+        return entrants.select(described), closing[described].astype(float)
 
 
 NO_ENTRIES, FIXED_RATE = NoEntries(), FixedRate()
@@ -277,6 +292,7 @@ def identify_entries(name: str | None) -> str | None:
     """Text that is equal for the same entry model: the name, or a hash of the file; None where nobody enters."""
     if name is None:
         return None
+    name = str(SHIPPED) if name == "fitted" else name
     return hashlib.sha256(Path(name).read_bytes()).hexdigest()[:16] if name.endswith(".npz") else name
 
 
@@ -287,12 +303,13 @@ def write_entries(path: Path, model: FittedEntries) -> None:
         path: File that `load_entries` reads.
         model: Weights of the regression, and the entrants of the logs.
     """
-    write_npz(path, moving=model.moving, standing=model.standing, **vars(model.entrants))
+    weights = {"moving": model.moving, "standing": model.standing, "closing_mps": model.closing_mps}
+    write_npz(path, **weights, **vars(model.entrants))
 
 
 def _read_entries(path: str) -> FittedEntries:
     weights, remedy = ("moving", "standing"), "fit it again with rlftsim entries fit"
-    names = (*weights, *(column.name for column in fields(Entrants)))
+    names = (*weights, "closing_mps", *(column.name for column in fields(Entrants)))
     try:
         arrays = read_npz(path, names, remedy)
     except FileNotFoundError:
@@ -306,16 +323,14 @@ def _read_entries(path: str) -> FittedEntries:
         is_right = np.isin(arrays["object_type"], (1, 2, 3)).all() and (arrays["speed_mps"] >= 0).all()
     if not is_right:
         raise DataError(f"{path}: no {', '.join(names)} as finite numbers of equal length in it: {remedy}.")
-    # the values of a file may be anything: rates stay below one entry per gate and half second, speeds below 180 km/h
-    moving, standing, *entrants = (column.clip(-50, 50) for column in columns if column is not None)
-    entrants = Entrants(entrants[0].astype(np.int64), *entrants[1:])
-    return FittedEntries(moving.astype(float), standing.astype(float), entrants)
+    # the values of a file may be anything: rates stay below two entries per gate and half second, speeds below 180 km/h
+    moving, standing, closing_mps, object_type, *rest = (c.clip(-50, 50) for c in columns if c is not None)
+    entrants = Entrants(object_type.astype(np.int64), *rest)
+    return FittedEntries(moving.astype(float), standing.astype(float), entrants, closing_mps)
 
 
-FITTED = _read_entries(str(Path(__file__).with_name("fitted_entries.npz")))
-"""Fitted to 120 long logs of 24 synthetic street networks:
-
-python -c 'from rlftsim.scenario.synthetic.generate import generate; generate("FIT", num_scenarios=120,
-    seed=(1 << 48) + 20261130, num_steps=711, splits={"training": 1.0}, scenarios_per_network=5)'
-rlftsim entries fit FIT src/rlftsim/rollout/fitted_entries.npz
-"""
+def __getattr__(name: str) -> FittedEntries:
+    """The shipped model, read when it is asked for."""
+    if name != "FITTED":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _read_entries(str(SHIPPED))

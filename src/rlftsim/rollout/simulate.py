@@ -59,7 +59,8 @@ def simulate(
         force: Function called before every advance with the state and the step that the decision starts at; may impose
             states on agents.
         entries: Model of who enters, for a single scenario with visitors (`open_world.add_visitors`); agents leave,
-            too; `force` has the last word. None = nobody enters or leaves.
+            too. `force` has the last word, and may then move only who never leaves, the ego. None = nobody enters or
+            leaves.
         observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error ends
             the simulation.
         may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
@@ -157,7 +158,8 @@ def _draw_decision_noise(
 
 
 def lead_ego(batch: ScenarioBatch, stride: int) -> Force:
-    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego.
+    """A `force` of `simulate` that leads the ego along the log, as agents are logged around the logged ego; where the
+    log lacks it, the policy drives.
 
     Args:
         batch: A single scenario.

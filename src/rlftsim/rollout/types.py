@@ -51,9 +51,17 @@ class AgentStates:
 
         Args:
             states: States of the same agents and steps, also of a single rollout for all of them; None = none.
+
+        Raises:
+            ConfigError: States of other agents or steps.
         """
         if states is None:
             return self
+        if states.valid.shape[2:] != self.valid.shape[2:]:
+            raise ConfigError(
+                f"force imposes states {list(states.valid.shape)}, agents and steps are {list(self.valid.shape)}: with "
+                "entries the batch has visitors (open_world.add_visitors)."
+            )
         position = torch.where(states.valid[..., None], states.position, self.position)
         return AgentStates(position, torch.where(states.valid, states.heading, self.heading), self.valid | states.valid)
 

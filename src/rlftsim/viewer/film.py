@@ -16,12 +16,14 @@ from PIL import Image
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.files import write_atomically
-from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import draw_agents, draw_scene, light_dots
 
 STEPS_PER_SECOND = 10
 HOLD_AT_END_S = 1.0
+JUMP = 1.2
+"""Distance of views that follow each other, as a multiple of half of the shown width."""
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -58,7 +60,7 @@ def to_film(
 
 
 class Camera:
-    """Draws single frames of a scene.
+    """Draws single frames of a scene. In films longer than 9.1 s the view jumps after an ego that leaves it.
 
     Args:
         animation: Scene, and a panel for each picture side by side.
@@ -70,9 +72,29 @@ class Camera:
         self._figure, self._axes = draw_scene(animation)
         self._figure.set_dpi(dots_per_inch)
         self._canvas = FigureCanvasAgg(self._figure)
+        self._centers = [animation.scene.focus[:2]] * len(self._axes)
+        self._draw_ground()
+
+    def _draw_ground(self) -> None:
+        """Draw the maps, which are copied under every frame, because they take most of the time."""
         self._canvas.draw()
-        # The map is drawn once and copied under every frame, because it takes most of the time.
         self._ground = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def _follow(self, panels: Sequence[Panel], step: int) -> None:
+        """Move the view of panels with long motion so that the ego is not far from the middle."""
+        radius = self.animation.scene.focus[2]
+        row = int(self.animation.scene.agents.is_ego.argmax())
+        centers = list(self._centers)
+        for number, panel in enumerate(panels):
+            if panel.trajectories.num_steps > TOTAL_STEPS:
+                ego = panel.trajectories.position[0, row]  # [S, 2]
+                start, now = ego[CURRENT_STEP], ego[min(step, len(ego) - 1)]
+                x, y = start + JUMP * radius * np.round((now - start) / (JUMP * radius))
+                centers[number] = float(x), float(y)
+                self._axes[number].set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius))
+        if centers != self._centers:
+            self._centers = centers
+            self._draw_ground()
 
     def frame(self, panels: Sequence[Panel], step: int, light_step: int | None = None) -> Frame:
         """Picture of the agents at a step.
@@ -83,6 +105,7 @@ class Camera:
             light_step: Step of the log whose traffic lights are drawn; None = `step`.
         """
         scene, lights_at = self.animation.scene, step if light_step is None else light_step
+        self._follow(panels, step)
         self._canvas.restore_region(self._ground)
         for axis, panel in zip(self._axes, panels):
             artists: list[Artist] = [*draw_agents(axis, scene.agents, panel, step), light_dots(axis, scene, lights_at)]
