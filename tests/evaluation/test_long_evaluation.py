@@ -1,6 +1,7 @@
 """Long rollouts held against the log of the same world, by windows of 10 s."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,10 +117,29 @@ def test_what_cannot_be_held_against_the_log_is_refused_in_one_line(long_road, t
     ):
         with pytest.raises(ConfigError, match=reason):
             rs.evaluate("constant_velocity", [long_road], **settings)
+    lacking = replace(long_road, tracks=replace(long_road.tracks, valid=long_road.tracks.valid.copy()))
+    lacking.tracks.valid[lacking.ego_index, 60:80] = False
+    with pytest.raises(DataError, match=r"lacks the ego 5\.0 s after now"):
+        rs.evaluate("constant_velocity", [lacking], seconds=10.0, ego="log")
     with pytest.raises(ConfigError, match="oracle"):
         rs.evaluate("oracle", [long_road], seconds=10.0)
     with pytest.raises(DataError, match="too short"):
         rs.evaluate("constant_velocity", [scenes.straight_road()], seconds=30.0)
+
+
+def test_windows_after_the_ego_has_left_the_map_do_not_count(monkeypatch):
+    monkeypatch.setattr(scenes, "TOTAL_STEPS", HISTORY_STEPS + 300)
+    scenario = scenes.build_scenario("long", map_features=scenes.straight_map())
+    x = np.stack([np.full(300, 10.0), 15 * np.arange(300) / 10])  # the second is 30 m off the lanes within 20 s
+    motion = Motion(
+        position=np.stack([x, np.zeros_like(x)], -1) + scenes.EGO_POSITION_M - scenario.origin,
+        heading=np.zeros_like(x), size=np.full((2, 3), 2.0), z=np.full(2, 3.8), valid=np.ones(x.shape, bool),
+        is_vehicle=np.ones(2, bool), ego=0,
+    )  # fmt: skip
+    stays, leaves = (measure_windows(replace(motion, ego=ego), scenario) for ego in (0, 1))
+    assert [len(window.density) for window in stays] == [20, 20, 20]
+    assert [len(window.density) for window in leaves] == [20, 0, 0]
+    assert [len(window.entries) for window in leaves] == [1, 0, 0]
 
 
 def test_a_world_in_which_nothing_moves_has_no_incidents(monkeypatch):

@@ -8,6 +8,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+import rlftsim as rs
+import scenes
 from rlftsim.errors import ConfigError
 from rlftsim.viewer.film import to_film
 from rlftsim.viewer.picture import draw_scene
@@ -62,3 +64,13 @@ def test_legend_and_small_print_of_a_single_panel_stay_inside_the_picture(animat
         box = part.get_window_extent()
         assert figure.bbox.x0 <= box.x0
         assert box.x1 <= figure.bbox.x1
+
+
+def test_a_long_film_follows_the_ego(tmp_path):
+    scenario = scenes.build_scenario("fast", (scenes.Mover(speed_mps=15.0),), scenes.straight_map())
+    rollouts = rs.simulate("constant_velocity", scenario, num_rollouts=1, seconds=20.0)
+    rs.film(scenario, rollouts, tmp_path / "film.mp4")
+    _, frames = read_mp4(tmp_path / "film.mp4")
+    for frame in frames[::10]:
+        half = frame[: int(len(frame) * 0.85), frame.shape[1] // 2 :].astype(int)  # the rollouts beside the log
+        assert ((half[..., 2] > 150) & (half[..., 0] < 90)).any()

@@ -34,8 +34,8 @@ class EnvConfig:
     traffic: Traffic = "policy"
     """Driver of all agents but the ego: policy, replay, constant_velocity, idm or sumo."""
     entries: str | None = None
-    """Model of who enters where lanes cross the border of a region around the ego, in traffic "policy": "none",
-    "fixed-rate", FILE.npz of `rlftsim entries fit`, or a plug-in; None = nobody enters or leaves."""
+    """Model of who enters where lanes cross the border of a region around the ego, in traffic "policy": "fitted",
+    "fixed-rate", "none", FILE.npz of `rlftsim entries fit`, or a plug-in; None = nobody enters or leaves."""
     drivers: Rules = field(default_factory=dict)
     """Drivers of some agents, the first match wins; see `assign_drivers`. They come before `traffic`."""
     action: ActionType = "bicycle"
