@@ -43,8 +43,8 @@ def drive(
         traffic: Drivers of the other agents, separated by commas: policy, replay, constant_velocity, idm, or
             sumo for data made by `rlftsim synthesize --keep-worlds`.
         entries: Who enters traffic "policy" where lanes cross the border of a region around the ego: "fitted",
-            "fixed-rate", "none", a file that `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents beyond the
-            border leave. Left out, the agents of "now" are there all the time.
+            "fixed-rate", "none", a file that `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents
+            beyond the border leave. Left out, the agents of "now" are there all the time.
         scenario: Ids of the scenarios to drive; left out, all of the split.
         limit: Number of scenarios, the first ones of the data set; left out, all of them.
         num_rollouts: Episodes of each scenario; the realism of the others is defined for 32.

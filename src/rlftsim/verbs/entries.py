@@ -12,8 +12,8 @@ from rlftsim.verbs.arguments import Name
 def fit(data: Name, out: Path, *, split: str = "training") -> None:
     """Fit a model of who enters a world, and how fast, to long logs, for `rlftsim simulate --entries FILE.npz`.
 
-    Poisson regressions of those that move and of those that stand, on how fast these come nearer and how many there are,
-    and the agents that entered in the logs.
+    Poisson regressions of those that move and of those that stand, on how fast these come nearer and how many there
+    are, and the agents that entered in the logs.
 
     Args:
         data: Folder of a data set of long logs, as `rlftsim synthesize --seconds 70` makes.

@@ -80,8 +80,8 @@ def simulate(
         seconds: Length of the rollouts. Scores, goals and submissions need the 8 of the metric; a longer rollout
             begins with the same states as one of 8 s.
         entries: Who enters where lanes cross the border of a region around the ego: "fitted", "fixed-rate", "none",
-            a file that `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents beyond the border leave. Left out,
-            the agents of "now" are there all the time.
+            a file that `rlftsim entries fit` wrote, or a name of an installed plug-in. Agents beyond the border leave.
+            Left out, the agents of "now" are there all the time.
         goals: Goals file (docs/goals.md). Without --scenario only its scenarios are simulated. In Python, for rollouts
             in memory, points in meters in the world frame, {object_id: (x, y)} or {scenario_id: {object_id: (x, y)}},
             or goals of the whole batch as tensors.
