@@ -20,6 +20,8 @@ from rlftsim.scenario.types import HISTORY_STEPS, STEP_S, Scenario, cached_on_sc
 LONGEST_STAND_S = 20.0
 FREE_WAY_M = 20.0
 """A vehicle with an agent or a red light so near ahead has a reason to stand."""
+OFF_MAP_M = 30.0
+"""An ego so far from every lane has left the map, as in an environment."""
 DEVICE = torch.device("cpu")
 MAX_PAIRS = DEFAULT_COMPUTE.pairs_on(DEVICE)
 
@@ -126,3 +128,17 @@ def _find_stuck(
     index = np.arange(num_samples)
     last_busy = np.maximum.accumulate(np.where(is_idle, -1, index), axis=1)
     return is_idle & ((index - last_busy) * STRIDE * STEP_S > LONGEST_STAND_S)
+
+
+def count_steps_on_map(motion: Motion, scenario: Scenario) -> int:
+    """Steps until no lane is near the ego; all of them on a map without lanes.
+
+    Args:
+        motion: Motion over S steps.
+        scenario: World with the map.
+    """
+    lanes, ego = find_lane_points(scenario), motion.position[motion.ego, ::STRIDE]
+    if lanes is None:
+        return motion.heading.shape[1]
+    is_off = lanes.tree.query(ego + scenario.origin)[0] > OFF_MAP_M
+    return int(is_off.argmax()) * STRIDE if is_off.any() else motion.heading.shape[1]

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.drift import find_lane_points
-from rlftsim.evaluation.incidents import Incidents, find_incidents
+from rlftsim.evaluation.incidents import Incidents, count_steps_on_map, find_incidents
 from rlftsim.evaluation.motion import MOVING_MPS, STRIDE, Motion, find_collisions, measure_gaps, read_log, read_rollouts
 from rlftsim.evaluation.resumable import check_same_work
 from rlftsim.jobs.files import write_text
@@ -40,8 +39,6 @@ from rlftsim.scenario.types import (
 
 WINDOW_STEPS = 100
 NEAR_M = 60.0
-OFF_MAP_M = 30.0
-"""An ego so far from every lane has left the map, as in an environment."""
 LONGEST_GAP_M = 60.0
 HEADINGS = (
     "world", "seconds", "agents within 60 m", "that move", "speed of these [m/s]", "W1 of speed [m/s]", "W1 of gap [m]",
@@ -255,7 +252,7 @@ def measure_windows(motion: Motion, scenario: Scenario) -> list[WindowSamples]:
     """
     num_windows, num_samples = motion.heading.shape[1] // WINDOW_STEPS, WINDOW_STEPS // STRIDE
     incidents = find_incidents(motion.steps(slice(num_windows * WINDOW_STEPS)), scenario)
-    on_map = _count_steps_on_map(motion, scenario) // WINDOW_STEPS
+    on_map = count_steps_on_map(motion, scenario) // WINDOW_STEPS
     measured = [
         _measure(
             motion.steps(slice(k * WINDOW_STEPS, (k + 1) * WINDOW_STEPS)),
@@ -264,15 +261,6 @@ def measure_windows(motion: Motion, scenario: Scenario) -> list[WindowSamples]:
         for k in range(min(num_windows, on_map))
     ]
     return measured + [NO_SAMPLES] * (num_windows - len(measured))
-
-
-def _count_steps_on_map(motion: Motion, scenario: Scenario) -> int:
-    """Steps until no lane is near the ego; all of them on a map without lanes."""
-    lanes, ego = find_lane_points(scenario), motion.position[motion.ego, ::STRIDE]
-    if lanes is None:
-        return motion.heading.shape[1]
-    is_off = lanes.tree.query(ego + scenario.origin)[0] > OFF_MAP_M
-    return int(is_off.argmax()) * STRIDE if is_off.any() else motion.heading.shape[1]
 
 
 def join_samples(samples: Sequence[WindowSamples]) -> WindowSamples:

@@ -33,8 +33,8 @@ python -c 'from rlftsim.scenario.synthetic.generate import generate; generate("F
 rlftsim entries fit FIT src/rlftsim/rollout/fitted_entries.npz
 """
 REACH_M, BEYOND_M = 15.0, 30.0
-"""Who becomes visible so little inside of the border or so little outside enters; the first is also the largest
-distance from the gate at which an entrant says where others enter.
+"""Largest distances from the border, inside and outside, of agents that enter a log; the first is also the largest
+distance from the gate of an entrant that is described.
 """
 FIXED_PER_S = 0.03
 """Entries per second of a gate where traffic drives in, of `fixed-rate`: about 100 vehicles per hour and lane."""
@@ -42,7 +42,7 @@ LEAST_MPS, LEAST_CLOSING_MPS = 0.3, 1.0
 LANE_HALF_WIDTH_M, MOST_TURN_RAD = 1.5, 0.4
 NEWTON_STEPS = 30
 RIDGE = np.diag([1e-3, 2.0, 2.0])
-"""Counts of entries that weigh as much as the prior that a weight is 0: a few logs say little of their densities."""
+"""Counts of entries that weigh as much as the prior of weights 0: a few logs say little of densities."""
 MOST_ENTRANTS = 2000
 """Entrants that a model keeps, evenly from all logs: more make the draw slower and no better."""
 
@@ -113,17 +113,15 @@ class FixedRate(NoEntries):
 
 @dataclass(frozen=True, eq=False)
 class FittedEntries:
-    """Poisson regressions of who moves and who stands, on the speed at which a lane's traffic and what stands come
-    nearer and on how many of these there are now; entrants of logs.
-    """
+    """Poisson regressions of moving and of standing entrants, on closing speed and density; entrants of logs."""
 
     moving: Float[np.ndarray, "3"]
-    """Weights of the inputs for those that move."""
+    """Weights of the inputs, moving entrants."""
     standing: Float[np.ndarray, "3"]
-    """Weights for those that stand, as parked cars do."""
+    """Weights of the inputs, standing entrants such as parked cars."""
     entrants: Entrants
     closing_mps: Float[np.ndarray, "K"]
-    """Speed at which each came nearer to the ego: who came fast came often, at other gates less so."""
+    """Closing speed of each entrant, m/s: a fast entrant is frequent at the gate of the log, and less so at others."""
 
     def expect(self, gates: Gates) -> Float[np.ndarray, "G"]:
         """Exponentials of both linear predictors."""

@@ -42,7 +42,7 @@ class Gates:
     moving_per_km: Float[np.ndarray, "G"]
     """Agents that move at the current step of the scenario, in the region around the ego and per km of its lanes."""
     standing_per_km: Float[np.ndarray, "G"]
-    """Agents that stand then."""
+    """Agents that stand at the current step."""
 
     def __len__(self) -> int:
         return len(self.heading)
@@ -78,7 +78,7 @@ class GateFinder:
         self.moving_per_km, self.standing_per_km = self._count_agents(scenario)
 
     def _count_agents(self, scenario: Scenario) -> tuple[float, float]:
-        """Agents per km of lanes that move, and that stand, with one more of each, so that no density is zero."""
+        """Moving and standing agents per km of lanes, with one more of each, so that no density is zero."""
         tracks, region_m = scenario.tracks, find_region_m(scenario)
         position = tracks.position[:, CURRENT_STEP, :2] - scenario.origin
         ego = position[scenario.ego_index]

@@ -47,7 +47,7 @@ class AgentStates:
         return AgentStates(*(values[:, :, :, start:stop] for values in vars(self).values()))
 
     def overlay(self, states: "AgentStates | None") -> "AgentStates":
-        """These states, and others in their place where those are imposed.
+        """The states, replaced where other states are imposed.
 
         Args:
             states: States of the same agents and steps, also of a single rollout for all of them; None = none.

@@ -23,9 +23,7 @@ from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
 from rlftsim.verbs.inputs import check_left_out, find_policy_name, to_policy, to_sampling, with_checked_arguments
 
 BY_METRIC, LONG = ("metric", "goals", "jobs", "guidance_scale", "work"), ("entries", "ego")
-"""Arguments without effect on rollouts of another length, which are held against the log by windows; and on those of
-8 s.
-"""
+"""Arguments without effect on long rollouts, and on rollouts of 8 s."""
 
 
 @overload

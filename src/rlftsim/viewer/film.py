@@ -60,7 +60,7 @@ def to_film(
 
 
 class Camera:
-    """Draws single frames of a scene. In films longer than 9.1 s the view jumps after an ego that leaves it.
+    """Draws single frames of a scene. In films longer than 9.1 s the view follows the ego in jumps.
 
     Args:
         animation: Scene, and a panel for each picture side by side.
@@ -76,7 +76,7 @@ class Camera:
         self._draw_ground()
 
     def _draw_ground(self) -> None:
-        """Draw the maps, which are copied under every frame, because they take most of the time."""
+        """Draw the maps, the slow part, once; every frame begins with a copy."""
         self._canvas.draw()
         self._ground = self._canvas.copy_from_bbox(self._figure.bbox)
 
