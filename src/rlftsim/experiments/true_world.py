@@ -18,6 +18,8 @@ from rlftsim.statistics import draw_clusters
 NUM_DRAWS = 2000
 CHANGED = 0.05
 """Episodes whose scores differ by more are counted."""
+VEHICLE_CONFLICTS = ("following", "merging", "crossing")
+"""In the rows; windows with any of these are the conflict windows."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from rlftsim.envs.conflicts import PEDESTRIAN, VEHICLE_CONFLICTS
 from rlftsim.experiments.results import format_origin
 from rlftsim.experiments.tables import TextTable
 from rlftsim.experiments.true_world import (
     CHANGED,
+    VEHICLE_CONFLICTS,
     Episodes,
     average,
     count_failures,
@@ -49,7 +49,7 @@ class WindowSet:
 
 def choose_sets(episodes: Episodes) -> list[WindowSet]:
     """Random windows, and all windows with a conflict of vehicles."""
-    has_conflict = np.array([not VEHICLE_CONFLICTS.isdisjoint(conflicts) for conflicts in episodes.conflicts])
+    has_conflict = np.array([not conflicts.isdisjoint(VEHICLE_CONFLICTS) for conflicts in episodes.conflicts])
     sets = [WindowSet("random windows", episodes.select(episodes.is_random))]
     return [*sets, WindowSet("conflict windows", episodes.select(has_conflict))] if has_conflict.any() else sets
 
@@ -135,7 +135,7 @@ def list_distances(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"
 
 def list_conflicts(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
     """Episodes by the conflicts of their windows, which may have several."""
-    names = (*sorted(VEHICLE_CONFLICTS), PEDESTRIAN)
+    names = (*VEHICLE_CONFLICTS, "pedestrian")
     masks = [(name, np.array([name in conflicts for conflicts in episodes.conflicts])) for name in names]
     masks.append(("none", np.array([not conflicts for conflicts in episodes.conflicts])))
     return [(name, np.broadcast_to(mask, (len(episodes.planners), len(mask)))) for name, mask in masks]
