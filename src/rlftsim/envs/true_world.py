@@ -77,18 +77,21 @@ class TrueWorldConfig:
             DataError: A scenario without a world.
         """
         folder = dataset_folder(self.data)
-        windows = {name: find_window(folder, name) for name in ScenarioDataset(folder).scenario_ids}
+        stored = {name: find_window(folder, name) for name in ScenarioDataset(folder).scenario_ids}
         by_network: dict[str, list[str]] = {}
-        for name, window in sorted(windows.items(), key=lambda item: (item[1].path, item[1].index)):
+        for name, window in sorted(stored.items(), key=lambda item: (item[1].path, item[1].index)):
             by_network.setdefault(window.path.stem, []).append(name)
         turns = sorted((turn, network) for network, names in by_network.items() for turn in range(len(names)))
         ordered = [(by_network[network][turn], network) for turn, network in turns]
-        random, rest = ordered[: self.limit], ordered[len(ordered[: self.limit]) :]
-        missing = self.conflict_windows and self.conflict_windows - sum(map(self._has_conflict, random))
-        chosen = list(islice(filter(self._has_conflict, rest), max(0, missing)))
+        num_random = len(ordered) if self.limit is None else self.limit
+        windows = ordered[:num_random]
+        if self.conflict_windows:
+            missing = self.conflict_windows - sum(map(self._has_conflict, windows))
+            windows = [*windows, *islice(filter(self._has_conflict, ordered[num_random:]), max(0, missing))]
         return [
-            Trip(self.data, name, network, surroundings, planner, self.seed, (name, network) in random)
-            for name, network in random + chosen for surroundings in self.surroundings for planner in self.planners
+            Trip(self.data, name, network, surroundings, planner, self.seed, is_random=number < num_random)
+            for number, (name, network) in enumerate(windows)
+            for surroundings in self.surroundings for planner in self.planners
         ]  # fmt: skip
 
     def _has_conflict(self, window: tuple[str, str]) -> bool:

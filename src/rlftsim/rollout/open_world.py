@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.entries import Entrants, EntryModel
-from rlftsim.rollout.gates import DECISION_STEPS, GateFinder, Gates, find_region_m
+from rlftsim.rollout.gates import DECISION_STEPS, STANDING_MPS, GateFinder, Gates, find_region_m
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch
@@ -38,8 +38,8 @@ EGO_GAP_M = 40.0
 BRAKING_MPS2 = 3.0
 STANDSTILL_GAP_M, BESIDE_M, ANYWHERE_M = 6.0, 2.3, 3.0
 """Least distance of centers along and across the way and in any direction; the first is left after braking, too."""
-PARKED_M, PARKED_MPS = 1.8, 0.3
-"""A vehicle that enters so far beside the lane's center and so slowly is parked, and stays."""
+PARKED_M = 1.8
+"""A vehicle that enters so far beside the lane's center and stands is parked, and stays."""
 OFF_LANES_M, ROADSIDE_M = 2.4, 2.8
 """Least distance of parked vehicles from the center of every lane, so that cars pass, and the usual one."""
 MOST_TURNED_AWAY = 5
@@ -236,7 +236,7 @@ class OpenWorld:
         lane, left, turn = gates.position[k], float(entrants.left_m[k]), float(entrants.turn_rad[k])
         side = np.array([-np.sin(gates.heading[k]), np.cos(gates.heading[k])])
         is_vehicle = entrants.object_type[k] == ObjectType.VEHICLE
-        if is_vehicle and (abs(left) <= PARKED_M or entrants.speed_mps[k] >= PARKED_MPS):
+        if is_vehicle and (abs(left) <= PARKED_M or entrants.speed_mps[k] >= STANDING_MPS):
             return lane, float(gates.heading[k]), False
         # a place to park may be on a lane of this road, then it is to the right of the gate's lane or of further ones
         beside = (left, *(-ROADSIDE_M - LANE_WIDTH_M * lanes for lanes in range(3)))

@@ -91,9 +91,10 @@ class Camera:
                 start, now = ego[CURRENT_STEP], ego[min(step, len(ego) - 1)]
                 x, y = start + JUMP * radius * np.round((now - start) / (JUMP * radius))
                 centers[number] = float(x), float(y)
-                self._axes[number].set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius))
         if centers != self._centers:
             self._centers = centers
+            for axis, (x, y) in zip(self._axes, centers):
+                axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius))
             self._draw_ground()
 
     def frame(self, panels: Sequence[Panel], step: int, light_step: int | None = None) -> Frame:
