@@ -113,6 +113,20 @@ def test_planners_are_driven_in_the_truth_and_in_other_traffic_and_a_second_call
     report = (tmp_path / "out" / "report.md").read_text()
     assert "2 windows of 1 networks × 2 planners" in report
     assert (tmp_path / "out" / "figure.png").exists()
-    monkeypatch.setattr("rlftsim.envs.true_world_episode.run_planner", None)  # a call would fail
-    assert main(command) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("rlftsim.envs.true_world_episode.run_planner", None)  # a call would fail
+        assert main(command) == 0
     assert (tmp_path / "out" / "report.md").read_text() == report
+    assert main([*command, "--rollouts", "2", "--films", "1"]) == 0
+    again = pq.read_table(tmp_path / "out" / "rows.parquet").to_pylist()
+    assert [row for row in again if not row["rollout"]] == table.to_pylist()
+    second = [row for row in again if row["rollout"] == 1]
+    assert {row["traffic"] for row in second} == {"demo-base"}
+    assert len(second) == 2 * 2
+    assert any(
+        row["nuplan_style"] != rows[row["window"], "demo-base", row["planner"]]["nuplan_style"] for row in second
+    )
+    page = (tmp_path / "out" / "films.html").read_text()
+    assert page.count("<figure") == 1
+    for name in ("truth", "demo-base", "replay", "idm"):
+        assert f">{name}: " in page

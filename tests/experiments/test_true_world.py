@@ -12,6 +12,7 @@ from rlftsim.experiments.true_world import (
     count_failures,
     draw_weights,
     find_interval,
+    find_largest_errors,
     measure_agreement,
 )
 from rlftsim.experiments.true_world_report import choose_sets
@@ -106,10 +107,10 @@ def test_the_interval_of_a_mean_is_that_of_the_networks():
     assert (high - low) / 2 == pytest.approx(1.96 * of_network.std(ddof=1) / np.sqrt(40), rel=0.08)
 
 
-def make_row(window, traffic, planner, score, conflicts="crossing following", is_random=True):
+def make_row(window, traffic, planner, score, conflicts="crossing following", is_random=True, rollout=0):
     return {
         "network": window[0], "window": window, "is_random": is_random, "conflicts": conflicts, "planner": planner,
-        "traffic": traffic, "rollout": 0, "nuplan_style": score,
+        "traffic": traffic, "rollout": rollout, "nuplan_style": score,
     }  # fmt: skip
 
 
@@ -127,6 +128,27 @@ def test_rows_are_arranged_and_unfinished_windows_left_out():
     assert (chosen.windows, chosen.values["nuplan_style"].shape) == (("b1",), (2, 2, 1))
     with pytest.raises(DataError, match="go on with the run"):
         arrange_episodes(rows[1:4], "truth")
+
+
+def test_of_several_rollouts_the_mean_counts():
+    scores = {("truth", 0): 1.0, ("tuned", 0): 0.2, ("tuned", 1): 0.4, ("tuned", 2): 0.9}
+    rows = [make_row("a1", t, "idm", score, rollout=rollout) for (t, rollout), score in scores.items()]
+    episodes = arrange_episodes(rows, "truth")
+    np.testing.assert_allclose(episodes.values["nuplan_style"], [[[1.0]], [[0.5]]])
+    assert episodes.num_rollouts == 3
+
+
+def test_the_windows_to_film_are_those_that_err_most_each_about_one_planner():
+    truth = {"a1": (1.0, 1.0), "b1": (1.0, 0.0), "c1": (0.5, np.nan), "d1": (0.3, 0.3)}
+    tuned = {"a1": (0.9, 0.8), "b1": (0.4, 1.0), "c1": (0.4, 1.0), "d1": (0.3, 0.3)}
+    rows = [
+        make_row(window, t, planner, score) for t, table in (("truth", truth), ("tuned", tuned))
+        for window, scores in table.items() for planner, score in zip(("log", "idm"), scores, strict=True)
+    ]  # fmt: skip
+    episodes = arrange_episodes(rows, "truth")
+    chosen = find_largest_errors(episodes, "nuplan_style", "tuned", 9)
+    assert chosen == [("b1", "idm"), ("a1", "idm"), ("c1", "log")]
+    assert find_largest_errors(episodes, "nuplan_style", "tuned", 1) == chosen[:1]
 
 
 def test_random_windows_are_apart_from_those_chosen_for_a_conflict():

@@ -5,7 +5,7 @@ stopped has measured the same of every planner.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import rlftsim
 from rlftsim.envs.conflicts import VEHICLE_CONFLICTS
 from rlftsim.envs.planners.registry import hash_code
+from rlftsim.envs.result import build_animation
 from rlftsim.envs.true_world_episode import PLANNERS, Surroundings, Trip, list_conflicts, load_model, read_row
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
@@ -26,6 +27,7 @@ from rlftsim.jobs.runner import Runner
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.synthetic.worlds import find_window
+from rlftsim.viewer.page import write_page
 
 ROWS = "rows.parquet"
 TRUTH = Surroundings("truth", "sumo")
@@ -60,11 +62,14 @@ class TrueWorldConfig:
     """Only the first so many windows."""
     conflict_windows: int = 0
     """Conflict windows to drive: the windows after the limit that have a conflict follow, until there are so many."""
+    rollouts: int = 1
+    """Rollouts of each episode in the traffic of a model; all other traffic is the same in each."""
 
     def __post_init__(self) -> None:
         if self.limit is not None:
             whole_number("limit", self.limit, 1)
         whole_number("conflict_windows", self.conflict_windows, 0)
+        whole_number("rollouts", self.rollouts, 1)
         for label, names in (("planners", self.planners), ("models", [s.name for s in self.surroundings])):
             if len({*names}) < len(names):
                 raise ConfigError(f"{label}: two of {', '.join(names)} have the same name: leave one out.")
@@ -89,9 +94,10 @@ class TrueWorldConfig:
             missing = self.conflict_windows - sum(map(self._has_conflict, windows))
             windows = [*windows, *islice(filter(self._has_conflict, ordered[num_random:]), max(0, missing))]
         return [
-            Trip(self.data, name, network, surroundings, planner, self.seed, is_random=number < num_random)
+            Trip(self.data, name, network, surroundings, planner, self.seed, number < num_random, rollout)
             for number, (name, network) in enumerate(windows)
             for surroundings in self.surroundings for planner in self.planners
+            for rollout in range(self.rollouts if surroundings.traffic == "policy" else 1)
         ]  # fmt: skip
 
     def _has_conflict(self, window: tuple[str, str]) -> bool:
@@ -113,7 +119,7 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     """
     check_folder(out, "results")
     trips = config.trips
-    codes = {trip.planner: hash_code(trip.planner_name) for trip in trips[: len(config.planners)]}
+    codes = {name: hash_code(PLANNERS.get(name, name)) for name in config.planners}
     models = {s.name: fingerprint_policy(load_model(s.model)) for s in config.surroundings if s.traffic == "policy"}
     manifest = hash_manifest(dataset_folder(config.data))
     identity = {
@@ -131,6 +137,32 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     table = pa.Table.from_pylist([{**row, "is_random": trip.is_random} for row, trip in zip(rows, trips, strict=True)])
     write_atomically(out / ROWS, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
     return table
+
+
+def write_films(
+    config: TrueWorldConfig, choices: Sequence[tuple[str, str]], traffic: Sequence[str], path: Path
+) -> None:
+    """Write a page of films of single episodes, each in several types of traffic side by side.
+
+    Args:
+        config: Windows, planners and types of traffic of the rows.
+        choices: Window and planner of each film, from top to bottom.
+        traffic: Names of the types of traffic, from left to right.
+        path: File of the page.
+
+    Raises:
+        EpisodeFailure: The planner or SUMO fails.
+    """
+    trips = {(trip.window, trip.planner, trip.surroundings.name): trip for trip in config.trips if not trip.rollout}
+    films = []
+    for window, planner in choices:
+        results = {name: trips[window, planner, name].run()[0] for name in traffic}
+        titles = {f"{name}: {result.planner.nuplan_style:.2f}": result.record for name, result in results.items()}
+        conflicts = ", ".join(sorted(list_conflicts(config.data, window))) or "no conflict"
+        animation = build_animation(titles)
+        films.append(replace(animation, title=f"{planner} in {window}", caption=f"At the current step: {conflicts}."))
+    caption = "The same planner from the same step on; beside each traffic the planner's nuPlan-style score."
+    write_page(path, "Windows in which traffic errs most about a planner", films, caption=caption)
 
 
 def _drive_trip(trips: Sequence[Trip], position: int) -> dict[str, object]:

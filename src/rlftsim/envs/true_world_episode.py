@@ -18,7 +18,9 @@ from rlftsim.envs.episode import Episode, ScenarioGoals
 from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planner_scores import PlannerScores
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
+from rlftsim.envs.result import Result
 from rlftsim.envs.source import Source
+from rlftsim.envs.sumo_traffic import SumoState
 from rlftsim.errors import ConfigError, EpisodeFailure, in_short
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import load_policy
@@ -79,34 +81,46 @@ class Trip:
     seed: int
     is_random: bool = True
     """False = the window was chosen for its conflict."""
+    rollout: int = 0
+    """Number of the rollout, each with dice of its own."""
 
     @property
     def name(self) -> str:
         """Stem of the file."""
-        return re.sub(r"[^\w.()=,+-]+", ".", f"{self.window}-{self.surroundings.name}-{self.planner}")
+        rollout = f"-{self.rollout}" if self.rollout else ""
+        return re.sub(r"[^\w.()=,+-]+", ".", f"{self.window}-{self.surroundings.name}-{self.planner}{rollout}")
 
     @property
     def planner_name(self) -> str:
         """Name that `load_planner` takes."""
         return PLANNERS.get(self.planner, self.planner)
 
-    def drive(self) -> dict[str, object]:
-        """Row of the episode; NaN where the planner fails, or SUMO."""
-        begin, planner = time.process_time(), load_planner(self.planner_name)
-        scenario = _load_scenario(self.data, self.window)
+    def run(self) -> tuple[Result, tuple[SumoState, ...]]:
+        """Result of the episode, and the last states of SUMO if it drives.
+
+        Raises:
+            EpisodeFailure: The planner or SUMO fails.
+        """
+        planner, scenario = load_planner(self.planner_name), _load_scenario(self.data, self.window)
         settings = tuple(sorted(read_action_settings(planner).items()))
         env = _make_environment(self.data, self.window, self.surroundings, settings)
+        result = run_planner(env, planner, scenario, seed=self.seed, rollout=self.rollout)
+        return result, env.state.world.sumo_states
+
+    def drive(self) -> dict[str, object]:
+        """Row of the episode; NaN where the planner fails, or SUMO."""
+        begin = time.process_time()
         row: dict[str, object] = {
             "network": self.network, "window": self.window,
             "conflicts": " ".join(sorted(list_conflicts(self.data, self.window))), "planner": self.planner,
-            "traffic": self.surroundings.name, "rollout": 0,
+            "traffic": self.surroundings.name, "rollout": self.rollout,
         }  # fmt: skip
         try:
-            result = run_planner(env, planner, scenario, seed=self.seed)
+            result, sumo_states = self.run()
         except EpisodeFailure as failure:
             log.warning(str(failure))
             return {"row": row | dict.fromkeys((*SCORES, *COUNTS), math.nan)}
-        record, sumo_states = result.record, env.state.world.sumo_states
+        record = result.record
         offset = record.agent_motion[-1, :2] - record.scene.logged[record.agent, CURRENT_STEP + record.steps, :2]
         counts = {
             "distance_m": float(np.hypot(*offset)),

@@ -7,6 +7,7 @@ for which every statistic is computed at once: the first set has equal weights, 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,9 @@ class Episodes:
     is_random: Bool[np.ndarray, "W"]
     """False = the window was chosen for its conflict."""
     values: Mapping[str, Float[np.ndarray, "T P W"]]
-    """Scores by column; NaN = the planner has failed."""
+    """Scores by column, means over rollouts; NaN = the planner has failed."""
+    num_rollouts: int = 1
+    """Rollouts in learned traffic."""
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "D W"]:
@@ -63,7 +66,7 @@ class Episodes:
 
 
 def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
-    """Episodes of rows; windows that lack an episode are left out.
+    """Episodes of rows, the mean over rollouts; windows that lack an episode are left out.
 
     Args:
         rows: Rows of `rlftsim experiment true-world`, in any order.
@@ -74,22 +77,41 @@ def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
     """
     traffic = tuple(dict.fromkeys([truth, *(row["traffic"] for row in rows)]))
     planners = tuple(dict.fromkeys(row["planner"] for row in rows))
-    by_window: dict[str, dict[tuple[str, str], Mapping[str, Any]]] = {}
+    by_window: dict[str, dict[tuple[str, str], list[Mapping[str, Any]]]] = {}
     for row in rows:
-        by_window.setdefault(row["window"], {})[row["traffic"], row["planner"]] = row
+        by_window.setdefault(row["window"], {}).setdefault((row["traffic"], row["planner"]), []).append(row)
     windows = [name for name, episodes in by_window.items() if len(episodes) == len(traffic) * len(planners)]
     if not windows:
         raise DataError("no window was driven by all planners in all traffic: go on with the run.")
-    first = [next(iter(by_window[name].values())) for name in windows]
+    first = [next(iter(by_window[name].values()))[0] for name in windows]
     columns = [name for name, value in first[0].items() if isinstance(value, float)]
-    values = {
-        column: np.array([[[by_window[w][t, p][column] for w in windows] for p in planners] for t in traffic], float)
-        for column in columns
-    }
+
+    def average_rollouts(column: str) -> Float[np.ndarray, "T P W"]:
+        cells = [[[by_window[w][t, p] for w in windows] for p in planners] for t in traffic]
+        return np.array([[[fmean(row[column] for row in cell) for cell in line] for line in table] for table in cells])
+
+    values = {column: average_rollouts(column) for column in columns}
     networks = tuple(row["network"] for row in first)
     conflicts = tuple(frozenset(row["conflicts"].split()) for row in first)
     is_random = np.array([row["is_random"] for row in first])
-    return Episodes(traffic, planners, tuple(windows), networks, conflicts, is_random, values)
+    num_rollouts = 1 + max(row["rollout"] for row in rows)
+    return Episodes(traffic, planners, tuple(windows), networks, conflicts, is_random, values, num_rollouts)
+
+
+def find_largest_errors(episodes: Episodes, column: str, traffic: str, count: int) -> list[tuple[str, str]]:
+    """Windows in which a score errs most against the truth, each with the planner that it errs about.
+
+    Args:
+        episodes: Episodes of all windows.
+        column: Name of the score.
+        traffic: Type of traffic that errs.
+        count: Number of windows, less where fewer have an error.
+    """
+    values = episodes.values[column]
+    errors = np.abs(values[episodes.traffic.index(traffic)] - values[0])  # [P, W]
+    errors = np.where(episodes.is_measured, errors, 0.0)
+    order = np.argsort(-errors.max(0), kind="stable")[:count]
+    return [(episodes.windows[w], episodes.planners[errors[:, w].argmax()]) for w in order if errors[:, w].any()]
 
 
 def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int) -> Float[np.ndarray, "D W"]:

@@ -89,9 +89,9 @@ def build_error_table(windows: WindowSet) -> TextTable:
         return [*cells, " · ".join(map(str, failures[t]))]
 
     note = (
-        f"{len(episodes.windows)} windows of {len({*episodes.networks})} networks × {len(episodes.planners)} planners, "
-        "one rollout. Errors against the truth; 95 % intervals by bootstrap over networks, "
-        "whose draws make absolute errors of means larger. Failures: at fault in both · missed · false."
+        f"{len(episodes.windows)} windows of {len({*episodes.networks})} networks × {len(episodes.planners)} planners; "
+        f"rollouts in learned traffic: {episodes.num_rollouts}. Errors against the truth; 95 % intervals by bootstrap "
+        "over networks, whose draws make absolute errors of means larger. Failures: at fault in both · missed · false."
     )
     return TextTable(f"Errors, {windows.name}", ("", *columns, "failures"), list_rows(episodes, format_errors), note)
 
@@ -200,7 +200,8 @@ def draw_figure(sets: Sequence[WindowSet], shown: Sequence[str]) -> Figure:
         episodes = windows.episodes
         for axis, (column, label) in zip(axes[row], ((SCORE, "nuPlan-style score"), (HIT, "hit rate"))):
             means = average(episodes.values[column], episodes.is_measured, episodes.weights)  # [D, T, P]
-            low, high = np.nanquantile(means[1:], (0.025, 0.975), axis=0)
+            drawn = means[1:] if np.isfinite(means[1:]).any() else means[:1]  # a single network has no draws
+            low, high = np.nanquantile(drawn, (0.025, 0.975), axis=0)
             for color, name in zip(COLORS, shown):
                 t = episodes.traffic.index(name)
                 spans = np.abs(np.stack([means[0] - low, high - means[0]]))  # [2, T, P]

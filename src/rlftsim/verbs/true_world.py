@@ -17,6 +17,8 @@ def true_world(
     shifts: tuple[float, ...] = (0.1,),
     limit: int | None = None,
     conflict_windows: int = 0,
+    rollouts: int = 1,
+    films: int = 0,
     seed: int = 0,
     jobs: int = 1,
     work: Work = Work(),  # noqa: B008
@@ -38,23 +40,29 @@ def true_world(
         shifts: Meters by which the world's drivers see the ego ahead of its place: the floor of every error.
         limit: Number of windows, one of each network in turn; left out, all of them.
         conflict_windows: Windows with a conflict of vehicles to drive, of those after the limit if it has too few.
+        rollouts: Rollouts of each episode in the traffic of models, whose mean counts.
+        films: Windows to film for OUT/films.html, those in which the last of the models errs most about a planner's
+            score: the world, that model, replay and IDM side by side.
         seed: Seed of the traffic.
         jobs: Processes, each with one thread. Changes no result.
         work: Machines that share the work.
     """
     # Imported late: the environments need packages of an extra, and help does not.
-    from rlftsim.envs.true_world import GHOST, RULES, TRUTH, TrueWorldConfig, drive_true_world, shift_truth
+    from rlftsim.envs.true_world import GHOST, RULES, TRUTH, TrueWorldConfig, drive_true_world, shift_truth, write_films
     from rlftsim.envs.true_world_episode import PLANNERS, Surroundings
-    from rlftsim.experiments.true_world import arrange_episodes
-    from rlftsim.experiments.true_world_report import write_report
+    from rlftsim.experiments.true_world import arrange_episodes, find_largest_errors
+    from rlftsim.experiments.true_world_report import SCORE, write_report
 
     learned = list(map(Surroundings.parse, filter(None, models.split(","))))
     chosen = tuple(PLANNERS) if planners == ALL else tuple(name.strip() for name in planners.split(","))
     surroundings = (TRUTH, GHOST, *RULES, *map(shift_truth, shifts), *learned)
-    config = TrueWorldConfig(data, surroundings, chosen, seed, limit, conflict_windows)
+    config = TrueWorldConfig(data, surroundings, chosen, seed, limit, conflict_windows, rollouts)
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(config.trips))
     table = drive_true_world(config, out, runner)
     episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
     for line in write_report(episodes, [s.name for s in learned], out, ghost=GHOST.name):
         print_line(f"* {line}")
+    if films and learned:
+        choices = find_largest_errors(episodes, SCORE, learned[-1].name, films)
+        write_films(config, choices, (TRUTH.name, learned[-1].name, "replay", "idm"), out / "films.html")
     print_line(out / "report.md")
