@@ -13,7 +13,7 @@ from rlftsim.envs import conflicts, sumo_traffic, true_world
 from rlftsim.envs.conflicts import CROSSING, FOLLOWING, MERGING, PEDESTRIAN, find_conflicts
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.true_world import GHOST, TRUTH, TrueWorldConfig
-from rlftsim.envs.true_world_episode import Surroundings
+from rlftsim.envs.true_world_traffic import Surroundings
 from rlftsim.errors import ConfigError
 from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.generate import generate
@@ -93,7 +93,9 @@ def test_conflict_windows_are_added_to_random_ones_until_there_are_enough(limit,
     not sumo.is_available() or importlib.util.find_spec("libsumo") is None,
     reason="the extra `synthetic` is not installed",
 )
-def test_planners_are_driven_in_the_truth_and_in_other_traffic_and_a_second_call_drives_nothing(tmp_path, monkeypatch):
+def test_planners_are_driven_in_the_truth_and_in_other_traffic_and_a_second_call_drives_nothing(
+    tmp_path, monkeypatch, capsys
+):
     generate(tmp_path / "data", num_scenarios=2, seed=77, splits={"exam": 1.0}, keep_worlds=True, show_progress=False)
     words = f"experiment true-world --data {tmp_path / 'data'} --models demo-base --planners log,hard_braker"
     command = [*words.split(), "--out", str(tmp_path / "out")]
@@ -126,6 +128,8 @@ def test_planners_are_driven_in_the_truth_and_in_other_traffic_and_a_second_call
     assert any(
         row["nuplan_style"] != rows[row["window"], "demo-base", row["planner"]]["nuplan_style"] for row in second
     )
+    assert main([*command, "--films", "1", "--models", ","]) == 2
+    assert "films show where a model errs: name one with --models." in capsys.readouterr().err
     page = (tmp_path / "out" / "films.html").read_text()
     assert page.count("<figure") == 1
     for name in ("truth", "demo-base", "replay", "idm"):

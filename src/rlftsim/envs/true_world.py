@@ -5,7 +5,7 @@ stopped has measured the same of every planner.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 import rlftsim
 from rlftsim.envs.conflicts import VEHICLE_CONFLICTS
 from rlftsim.envs.planners.registry import hash_code
-from rlftsim.envs.result import build_animation
-from rlftsim.envs.true_world_episode import PLANNERS, Surroundings, Trip, list_conflicts, load_model, read_row
+from rlftsim.envs.true_world_episode import PLANNERS, Trip, read_row
+from rlftsim.envs.true_world_traffic import Surroundings, list_conflicts, load_model
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import hash_manifest
@@ -27,7 +27,6 @@ from rlftsim.jobs.runner import Runner
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
 from rlftsim.scenario.synthetic.worlds import find_window
-from rlftsim.viewer.page import write_page
 
 ROWS = "rows.parquet"
 TRUTH = Surroundings("truth", "sumo")
@@ -137,32 +136,6 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     table = pa.Table.from_pylist([{**row, "is_random": trip.is_random} for row, trip in zip(rows, trips, strict=True)])
     write_atomically(out / ROWS, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
     return table
-
-
-def write_films(
-    config: TrueWorldConfig, choices: Sequence[tuple[str, str]], traffic: Sequence[str], path: Path
-) -> None:
-    """Write a page of films of single episodes, each in several types of traffic side by side.
-
-    Args:
-        config: Windows, planners and types of traffic of the rows.
-        choices: Window and planner of each film, from top to bottom.
-        traffic: Names of the types of traffic, from left to right.
-        path: File of the page.
-
-    Raises:
-        EpisodeFailure: The planner or SUMO fails.
-    """
-    trips = {(trip.window, trip.planner, trip.surroundings.name): trip for trip in config.trips if not trip.rollout}
-    films = []
-    for window, planner in choices:
-        results = {name: trips[window, planner, name].run()[0] for name in traffic}
-        titles = {f"{name}: {result.planner.nuplan_style:.2f}": result.record for name, result in results.items()}
-        conflicts = ", ".join(sorted(list_conflicts(config.data, window))) or "no conflict"
-        animation = build_animation(titles)
-        films.append(replace(animation, title=f"{planner} in {window}", caption=f"At the current step: {conflicts}."))
-    caption = "The same planner from the same step on; beside each traffic the planner's nuPlan-style score."
-    write_page(path, "Windows in which traffic errs most about a planner", films, caption=caption)
 
 
 def _drive_trip(trips: Sequence[Trip], position: int) -> dict[str, object]:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from rlftsim.errors import ConfigError, whole_number
 from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import Work, choose_runner
 
@@ -48,12 +49,16 @@ def true_world(
         work: Machines that share the work.
     """
     # Imported late: the environments need packages of an extra, and help does not.
-    from rlftsim.envs.true_world import GHOST, RULES, TRUTH, TrueWorldConfig, drive_true_world, shift_truth, write_films
-    from rlftsim.envs.true_world_episode import PLANNERS, Surroundings
+    from rlftsim.envs.true_world import GHOST, RULES, TRUTH, TrueWorldConfig, drive_true_world, shift_truth
+    from rlftsim.envs.true_world_episode import PLANNERS
+    from rlftsim.envs.true_world_films import write_films
+    from rlftsim.envs.true_world_traffic import Surroundings
     from rlftsim.experiments.true_world import arrange_episodes, find_largest_errors
     from rlftsim.experiments.true_world_report import SCORE, write_report
 
     learned = list(map(Surroundings.parse, filter(None, models.split(","))))
+    if whole_number("films", films, 0) and not learned:
+        raise ConfigError("films show where a model errs: name one with --models.")
     chosen = tuple(PLANNERS) if planners == ALL else tuple(name.strip() for name in planners.split(","))
     surroundings = (TRUTH, GHOST, *RULES, *map(shift_truth, shifts), *learned)
     config = TrueWorldConfig(data, surroundings, chosen, seed, limit, conflict_windows, rollouts)
@@ -62,7 +67,7 @@ def true_world(
     episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
     for line in write_report(episodes, [s.name for s in learned], out, ghost=GHOST.name):
         print_line(f"* {line}")
-    if films and learned:
+    if films:
         choices = find_largest_errors(episodes, SCORE, learned[-1].name, films)
         write_films(config, choices, (TRUTH.name, learned[-1].name, "replay", "idm"), out / "films.html")
     print_line(out / "report.md")
