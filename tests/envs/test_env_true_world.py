@@ -84,6 +84,10 @@ def test_conflict_windows_are_added_to_random_ones_until_there_are_enough(limit,
     monkeypatch.setattr(
         true_world, "list_conflicts", lambda _, name: frozenset({"crossing" if "b" in name else "pedestrian"})
     )
+    model = Surroundings("tuned", "policy")
+    config = TrueWorldConfig("data", (TRUTH, model), ("log",), limit=1, num_rollouts=2)
+    trips = [(trip.surroundings.name, trip.rollout, trip.name) for trip in config.trips]
+    assert trips == [("truth", 0, "a0-truth-log"), ("tuned", 0, "a0-tuned-log"), ("tuned", 1, "a0-tuned-log~1")]
     config = TrueWorldConfig("data", (TRUTH,), ("log",), limit=limit, conflict_windows=wanted)
     assert " ".join(trip.window for trip in config.trips) == windows
     assert [trip.is_random for trip in config.trips] == [k < (limit or 4) for k in range(len(config.trips))]
@@ -119,18 +123,28 @@ def test_planners_are_driven_in_the_truth_and_in_other_traffic_and_a_second_call
         patch.setattr("rlftsim.envs.true_world_episode.run_planner", None)  # a call would fail
         assert main(command) == 0
     assert (tmp_path / "out" / "report.md").read_text() == report
-    assert main([*command, "--rollouts", "2", "--films", "1"]) == 0
+    assert main([*command, "--num-rollouts", "2", "--films", "1"]) == 0
     again = pq.read_table(tmp_path / "out" / "rows.parquet").to_pylist()
     assert [row for row in again if not row["rollout"]] == table.to_pylist()
     second = [row for row in again if row["rollout"] == 1]
-    assert {row["traffic"] for row in second} == {"demo-base"}
-    assert len(second) == 2 * 2
-    assert any(
-        row["nuplan_style"] != rows[row["window"], "demo-base", row["planner"]]["nuplan_style"] for row in second
-    )
+    assert {row["traffic"] for row in second} == {"demo-base", "idm"}
+    assert len(second) == 2 * 2 * 2
+    first = [rows[row["window"], row["traffic"], row["planner"]] for row in second]
+    assert any(row["nuplan_style"] != before["nuplan_style"] for row, before in zip(second, first, strict=True))
     assert main([*command, "--films", "1", "--models", ","]) == 2
     assert "films show where a model errs: name one with --models." in capsys.readouterr().err
     page = (tmp_path / "out" / "films.html").read_text()
     assert page.count("<figure") == 1
-    for name in ("truth", "demo-base", "replay", "idm"):
-        assert f">{name}: " in page
+    truth = {(w, p): row["nuplan_style"] for (w, t, p), row in rows.items() if t == "truth"}
+    errors = {
+        (row["window"], row["planner"], row["rollout"]): abs(row["nuplan_style"] - truth[row["window"], row["planner"]])
+        for row in again if row["traffic"] == "demo-base"
+    }  # fmt: skip
+    window, planner, rollout = max(errors, key=lambda key: errors[key])
+    assert f"{planner} in {window}" in page
+    for traffic in ("truth", "demo-base", "replay", "idm"):
+        shown = {
+            row["rollout"]: row["nuplan_style"] for row in again
+            if (row["window"], row["planner"], row["traffic"]) == (window, planner, traffic)
+        }  # fmt: skip
+        assert f">{traffic}: {shown.get(rollout, shown[0]):.2f}" in page

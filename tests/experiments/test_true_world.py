@@ -24,7 +24,7 @@ ALL = np.ones((3, 4), bool)
 
 
 def measure(*traffic, mask=ALL):
-    values = np.array([TRUTH, *traffic])
+    values = np.array([[TRUTH, *traffic]])  # a single rollout
     return {name: table[0] for name, table in measure_agreement(values, mask, EQUAL).items()}
 
 
@@ -61,7 +61,7 @@ def test_episodes_that_do_not_count_change_nothing():
 def test_a_planner_that_always_fails_leaves_the_statistics_of_the_others():
     simulated, mask = np.array(TRUTH) + 0.1, ALL.copy()
     simulated[2], mask[2] = np.nan, False
-    without = measure_agreement(np.array([TRUTH, simulated])[:, :2], ALL[:2], EQUAL)
+    without = measure_agreement(np.array([[TRUTH, simulated]])[:, :, :2], ALL[:2], EQUAL)
     for name, statistic in measure(simulated, mask=mask).items():
         np.testing.assert_array_equal(statistic, without[name][0])
         assert np.isfinite(statistic).all()
@@ -83,8 +83,10 @@ def test_failures_are_found_missed_and_false():
     truth = np.array([[1, 1, 0, 0]], bool)
     simulated = np.array([[1, 0, 1, 0]], bool)
     mask = np.array([[True, True, True, True]])
-    assert count_failures(np.array([truth, simulated]), mask) == [(2, 0, 0), (1, 1, 1)]
-    assert count_failures(np.array([truth, simulated]), mask & [True, False, True, True])[1] == (1, 0, 1)
+    assert count_failures(np.array([[truth, simulated]]), mask) == [(2, 0, 0), (1, 1, 1)]
+    assert count_failures(np.array([[truth, simulated]]), mask & [True, False, True, True])[1] == (1, 0, 1)
+    # of two rollouts the mean: what fails in a single one of them is half a failure
+    assert count_failures(np.array([[truth, simulated], [truth, truth]]), mask) == [(2, 0, 0), (1.5, 0.5, 0.5)]
 
 
 def test_networks_are_drawn_whole():
@@ -101,7 +103,7 @@ def test_the_interval_of_a_mean_is_that_of_the_networks():
     of_network = np.random.default_rng(0).normal(size=40)
     values = np.repeat(of_network, 10)[None, None]
     weights = draw_weights(np.repeat(np.arange(40), 10), 4000)
-    tables = np.concatenate([np.zeros_like(values), values])
+    tables = np.concatenate([np.zeros_like(values), values])[None]
     mean, low, high = find_interval(measure_agreement(tables, np.ones((1, 400), bool), weights)["bias"][:, 1])
     assert mean == pytest.approx(of_network.mean())
     assert (high - low) / 2 == pytest.approx(1.96 * of_network.std(ddof=1) / np.sqrt(40), rel=0.08)
@@ -123,19 +125,30 @@ def test_rows_are_arranged_and_unfinished_windows_left_out():
     assert episodes.traffic == ("truth", "replay")
     assert (episodes.windows, episodes.networks) == (("a1", "b1"), ("a", "b"))
     assert episodes.conflicts[0] == {"crossing", "following"}
-    assert episodes.values["nuplan_style"].tolist() == [[[10, 11], [10, 11]], [[0, 1], [0, 1]]]
+    assert episodes.values["nuplan_style"].tolist() == [[[[10, 11], [10, 11]], [[0, 1], [0, 1]]]]
     chosen = episodes.select(np.array([False, True]))
-    assert (chosen.windows, chosen.values["nuplan_style"].shape) == (("b1",), (2, 2, 1))
+    assert (chosen.windows, chosen.values["nuplan_style"].shape) == (("b1",), (1, 2, 2, 1))
     with pytest.raises(DataError, match="go on with the run"):
         arrange_episodes(rows[1:4], "truth")
 
 
-def test_of_several_rollouts_the_mean_counts():
-    scores = {("truth", 0): 1.0, ("tuned", 0): 0.2, ("tuned", 1): 0.4, ("tuned", 2): 0.9}
+def test_rollouts_cancel_in_the_mean_of_a_planner_and_not_in_the_error_of_an_episode():
+    scores = {("truth", 0): 0.5, ("tuned", 0): 0.0, ("tuned", 1): 1.0, ("tuned", 2): 0.5, ("tuned", 3): 0.5}
     rows = [make_row("a1", t, "idm", score, rollout=rollout) for (t, rollout), score in scores.items()]
     episodes = arrange_episodes(rows, "truth")
-    np.testing.assert_allclose(episodes.values["nuplan_style"], [[[1.0]], [[0.5]]])
-    assert episodes.num_rollouts == 3
+    np.testing.assert_array_equal(episodes.values["nuplan_style"][:, :, 0, 0].T, [[0.5] * 4, [0.0, 1.0, 0.5, 0.5]])
+    numbers = measure_agreement(episodes.values["nuplan_style"], episodes.is_measured, np.ones((1, 1)))
+    assert (numbers["planner_error"][0, 1], numbers["episode_error"][0, 1], numbers["changed"][0, 1]) == (0, 0.25, 0.5)
+    assert find_largest_errors(episodes, "nuplan_style", "tuned", 1) == [("a1", "idm", 0)]
+    with pytest.raises(DataError, match="go on with the run"):  # a window that lacks a rollout
+        arrange_episodes([*rows, make_row("b1", "truth", "idm", 0.5), make_row("b1", "tuned", "idm", 0.5)][2:], "truth")
+
+
+def test_an_episode_in_which_a_rollout_has_failed_does_not_count():
+    scores = {("truth", 0): 0.5, ("tuned", 0): 0.5, ("tuned", 1): np.nan}
+    rows = [make_row("a1", t, "idm", score, rollout=rollout) for (t, rollout), score in scores.items()]
+    rows += [make_row("a1", t, "log", 0.5, rollout=rollout) for t, rollout in scores]
+    assert arrange_episodes(rows, "truth").is_measured.tolist() == [[False], [True]]
 
 
 def test_the_windows_to_film_are_those_that_err_most_each_about_one_planner():
@@ -145,9 +158,13 @@ def test_the_windows_to_film_are_those_that_err_most_each_about_one_planner():
         make_row(window, t, planner, score) for t, table in (("truth", truth), ("tuned", tuned))
         for window, scores in table.items() for planner, score in zip(("log", "idm"), scores, strict=True)
     ]  # fmt: skip
+    rows += [
+        {**row, "rollout": 1, "nuplan_style": 0.0} for row in rows if (row["window"], row["traffic"]) == ("a1", "tuned")
+    ]
+    rows += [{**row, "rollout": 1} for row in rows if row["window"] != "a1" and row["traffic"] == "tuned"]
     episodes = arrange_episodes(rows, "truth")
     chosen = find_largest_errors(episodes, "nuplan_style", "tuned", 9)
-    assert chosen == [("b1", "idm"), ("a1", "idm"), ("c1", "log")]
+    assert chosen == [("a1", "log", 1), ("b1", "idm", 0), ("c1", "log", 0)]
     assert find_largest_errors(episodes, "nuplan_style", "tuned", 1) == chosen[:1]
 
 

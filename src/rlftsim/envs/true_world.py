@@ -61,14 +61,14 @@ class TrueWorldConfig:
     """Only the first so many windows."""
     conflict_windows: int = 0
     """Conflict windows to drive: the windows after the limit that have a conflict follow, until there are so many."""
-    rollouts: int = 1
-    """Rollouts of each episode in the traffic of a model; all other traffic is the same in each."""
+    num_rollouts: int = 1
+    """Rollouts of each episode in traffic with a model; all other traffic is the same in each."""
 
     def __post_init__(self) -> None:
         if self.limit is not None:
             whole_number("limit", self.limit, 1)
         whole_number("conflict_windows", self.conflict_windows, 0)
-        whole_number("rollouts", self.rollouts, 1)
+        whole_number("num_rollouts", self.num_rollouts, 1)
         for label, names in (("planners", self.planners), ("models", [s.name for s in self.surroundings])):
             if len({*names}) < len(names):
                 raise ConfigError(f"{label}: two of {', '.join(names)} have the same name: leave one out.")
@@ -96,7 +96,7 @@ class TrueWorldConfig:
             Trip(self.data, name, network, surroundings, planner, self.seed, number < num_random, rollout)
             for number, (name, network) in enumerate(windows)
             for surroundings in self.surroundings for planner in self.planners
-            for rollout in range(self.rollouts if surroundings.traffic == "policy" else 1)
+            for rollout in range(self.num_rollouts if surroundings.has_model else 1)
         ]  # fmt: skip
 
     def _has_conflict(self, window: tuple[str, str]) -> bool:
@@ -118,7 +118,7 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     """
     check_folder(out, "results")
     trips = config.trips
-    codes = {name: hash_code(PLANNERS.get(name, name)) for name in config.planners}
+    codes = {name: hash_code(planner_name) for name, planner_name in {(t.planner, t.planner_name) for t in trips}}
     models = {s.name: fingerprint_policy(load_model(s.model)) for s in config.surroundings if s.traffic == "policy"}
     manifest = hash_manifest(dataset_folder(config.data))
     identity = {
@@ -129,6 +129,8 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
         }
         for trip in trips
     }  # fmt: skip
+    if len(identity) < len(trips):
+        raise ConfigError("two planners or models have names that differ in signs alone: leave one out.")
     names = [trip.name for trip in trips]
     format = ScenarioValues(out / "episodes", names, identity, read_row)
     rows = measure_scenarios("episodes", partial(_drive_trip, trips), format, runner=runner)

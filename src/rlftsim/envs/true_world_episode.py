@@ -52,8 +52,8 @@ class Trip:
     @property
     def name(self) -> str:
         """Stem of the file."""
-        rollout = f"-{self.rollout}" if self.rollout else ""
-        return re.sub(r"[^\w.()=,+-]+", ".", f"{self.window}-{self.surroundings.name}-{self.planner}{rollout}")
+        name = re.sub(r"[^\w.()=,+-]+", ".", f"{self.window}-{self.surroundings.name}-{self.planner}")
+        return f"{name}~{self.rollout}" if self.rollout else name
 
     @property
     def planner_name(self) -> str:

@@ -7,33 +7,38 @@ from pathlib import Path
 from rlftsim.envs.result import build_animation
 from rlftsim.envs.true_world import TrueWorldConfig
 from rlftsim.envs.true_world_traffic import list_conflicts
-from rlftsim.jobs.progress import progress_bar
+from rlftsim.errors import EpisodeFailure
+from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.viewer.page import write_page
 
 
 def write_films(
-    config: TrueWorldConfig, choices: Sequence[tuple[str, str]], traffic: Sequence[str], path: Path
+    config: TrueWorldConfig, choices: Sequence[tuple[str, str, int]], traffic: Sequence[str], path: Path
 ) -> None:
-    """Write a page of films of single episodes, each in several types of traffic side by side.
+    """Write a page of films of single episodes, each in several types of traffic side by side; none that SUMO or the
+    planner does not drive again.
 
     Args:
         config: Windows, planners and types of traffic of the rows.
-        choices: Window and planner of each film, from top to bottom.
+        choices: Window, planner and rollout of each film, from top to bottom.
         traffic: Names of the types of traffic, from left to right.
         path: File of the page.
-
-    Raises:
-        EpisodeFailure: The planner or SUMO fails.
     """
-    trips = {(trip.window, trip.planner, trip.surroundings.name): trip for trip in config.trips if not trip.rollout}
+    trips = {(trip.window, trip.planner, trip.rollout, trip.surroundings.name): trip for trip in config.trips}
     films = []
     with progress_bar("films", len(choices)) as advance:
-        for window, planner in choices:
-            results = {name: trips[window, planner, name].run()[0] for name in traffic}
-            titles = {f"{name}: {result.planner.nuplan_style:.2f}": result.record for name, result in results.items()}
-            conflicts = ", ".join(sorted(list_conflicts(config.data, window))) or "no conflict"
-            title, caption = f"{planner} in {window}", f"At the current step: {conflicts}."
-            films.append(replace(build_animation(titles), title=title, caption=caption))
+        for window, planner, rollout in choices:
+            chosen = [trips.get((window, planner, rollout, name), trips[window, planner, 0, name]) for name in traffic]
+            try:
+                results = [trip.run()[0] for trip in chosen]
+            except EpisodeFailure as failure:
+                log.warning(f"no film of {planner} in {window}: {failure}")
+                continue
+            scores = (f"{name}: {result.planner.nuplan_style:.2f}" for name, result in zip(traffic, results))
+            animation = build_animation(dict(zip(scores, (result.record for result in results))))
+            conflicts = ", ".join(sorted(list_conflicts(config.data, window))) or "none"
+            caption = f"Conflicts at the current step: {conflicts}. Rollout {rollout}."
+            films.append(replace(animation, title=f"{planner} in {window}", caption=caption))
             advance()
     caption = "The same planner from the same step on; beside each traffic the planner's nuPlan-style score."
     write_page(path, "Windows in which traffic errs most about a planner", films, caption=caption)

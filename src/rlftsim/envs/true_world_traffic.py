@@ -28,6 +28,11 @@ class Surroundings:
     ahead_m: float | None = 0.0
     """Of SUMO's ego before the planner's, see `SumoScene`."""
 
+    @property
+    def has_model(self) -> bool:
+        """True where a model drives some of the others: all, or with IDM those that are no vehicles."""
+        return self.traffic in ("policy", "idm")
+
     @classmethod
     def parse(cls, text: str) -> "Surroundings":
         """Traffic by a model, of "demo-tuned", "NAME=MODEL" or "MODEL@TEMPERATURE".
@@ -70,7 +75,7 @@ def make_environment(data: str, window: str, surroundings: Surroundings, setting
         data=data, split=None, model=surroundings.model, traffic=surroundings.traffic, stop_on=(), reward="none",
         temperature=surroundings.temperature, **dict(settings),
     )  # fmt: skip
-    policy = load_model(surroundings.model) if surroundings.traffic in ("policy", "idm") else None
+    policy = load_model(surroundings.model) if surroundings.has_model else None
     source = _WorldSource(config, [load_scenario(data, window)], policy)
     source.ahead_m = surroundings.ahead_m
     return EgoEnv(source=source)

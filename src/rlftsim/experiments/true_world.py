@@ -1,13 +1,13 @@
 """Agreement of simulated traffic with the world that made the logs: errors, rankings and failures of planners.
 
-Shapes: T types of traffic, of which the first is the truth; P planners, W windows, D sets of weights of the windows,
-for which every statistic is computed at once: the first set has equal weights, the others are draws of whole networks.
+Shapes: N rollouts, T types of traffic, of which the first is the truth; P planners, W windows, D sets of weights of the
+windows, for which every statistic is computed at once: the first set has equal weights, the others are draws of whole
+networks.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -37,10 +37,8 @@ class Episodes:
     """Of each window."""
     is_random: Bool[np.ndarray, "W"]
     """False = the window was chosen for its conflict."""
-    values: Mapping[str, Float[np.ndarray, "T P W"]]
-    """Scores by column, means over rollouts; NaN = the planner has failed."""
-    num_rollouts: int = 1
-    """Rollouts in learned traffic."""
+    values: Mapping[str, Float[np.ndarray, "N T P W"]]
+    """Scores by column; NaN = the planner has failed. Traffic that is the same in each rollout is repeated."""
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "D W"]:
@@ -50,8 +48,8 @@ class Episodes:
 
     @cached_property
     def is_measured(self) -> Bool[np.ndarray, "P W"]:
-        """True where the planner has driven in all traffic."""
-        return np.asarray(np.isfinite(self.values["nuplan_style"]).all(0))
+        """True where the planner has driven in all traffic and all rollouts."""
+        return np.asarray(np.isfinite(self.values["nuplan_style"]).all((0, 1)))
 
     def select(self, is_chosen: Bool[np.ndarray, "W"]) -> "Episodes":
         """Episodes of some windows."""
@@ -66,7 +64,7 @@ class Episodes:
 
 
 def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
-    """Episodes of rows, the mean over rollouts; windows that lack an episode are left out.
+    """Episodes of rows; windows that lack an episode are left out.
 
     Args:
         rows: Rows of `rlftsim experiment true-world`, in any order.
@@ -77,29 +75,32 @@ def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
     """
     traffic = tuple(dict.fromkeys([truth, *(row["traffic"] for row in rows)]))
     planners = tuple(dict.fromkeys(row["planner"] for row in rows))
-    by_window: dict[str, dict[tuple[str, str], list[Mapping[str, Any]]]] = {}
+    num_rollouts = 1 + max((row["rollout"] for row in rows), default=0)
+    has_rollouts = {row["traffic"] for row in rows if row["rollout"]}
+    by_window: dict[str, dict[tuple[int, str, str], Mapping[str, Any]]] = {}
     for row in rows:
-        by_window.setdefault(row["window"], {}).setdefault((row["traffic"], row["planner"]), []).append(row)
-    windows = [name for name, episodes in by_window.items() if len(episodes) == len(traffic) * len(planners)]
+        repeated = range(row["rollout"], row["rollout"] + 1) if row["traffic"] in has_rollouts else range(num_rollouts)
+        episodes = by_window.setdefault(row["window"], {})
+        episodes |= {(rollout, row["traffic"], row["planner"]): row for rollout in repeated}
+    count = num_rollouts * len(traffic) * len(planners)
+    windows = [name for name, episodes in by_window.items() if len(episodes) == count]
     if not windows:
         raise DataError("no window was driven by all planners in all traffic: go on with the run.")
-    first = [next(iter(by_window[name].values()))[0] for name in windows]
+    first = [next(iter(by_window[name].values())) for name in windows]
     columns = [name for name, value in first[0].items() if isinstance(value, float)]
-
-    def average_rollouts(column: str) -> Float[np.ndarray, "T P W"]:
-        cells = [[[by_window[w][t, p] for w in windows] for p in planners] for t in traffic]
-        return np.array([[[fmean(row[column] for row in cell) for cell in line] for line in table] for table in cells])
-
-    values = {column: average_rollouts(column) for column in columns}
+    keys = [[[(n, t, p) for p in planners] for t in traffic] for n in range(num_rollouts)]
+    values = {
+        column: np.array([[[[by_window[w][key][column] for w in windows] for key in k] for k in part] for part in keys])
+        for column in columns
+    }
     networks = tuple(row["network"] for row in first)
     conflicts = tuple(frozenset(row["conflicts"].split()) for row in first)
     is_random = np.array([row["is_random"] for row in first])
-    num_rollouts = 1 + max(row["rollout"] for row in rows)
-    return Episodes(traffic, planners, tuple(windows), networks, conflicts, is_random, values, num_rollouts)
+    return Episodes(traffic, planners, tuple(windows), networks, conflicts, is_random, values)
 
 
-def find_largest_errors(episodes: Episodes, column: str, traffic: str, count: int) -> list[tuple[str, str]]:
-    """Windows in which a score errs most against the truth, each with the planner that it errs about.
+def find_largest_errors(episodes: Episodes, column: str, traffic: str, count: int) -> list[tuple[str, str, int]]:
+    """Windows in which a score errs most against the truth, each with the planner and the rollout of that error.
 
     Args:
         episodes: Episodes of all windows.
@@ -108,10 +109,11 @@ def find_largest_errors(episodes: Episodes, column: str, traffic: str, count: in
         count: Number of windows, less where fewer have an error.
     """
     values = episodes.values[column]
-    errors = np.abs(values[episodes.traffic.index(traffic)] - values[0])  # [P, W]
+    errors = np.abs(values[:, episodes.traffic.index(traffic)] - values[:, 0])  # [N, P, W]
     errors = np.where(episodes.is_measured, errors, 0.0)
-    order = np.argsort(-errors.max(0), kind="stable")[:count]
-    return [(episodes.windows[w], episodes.planners[errors[:, w].argmax()]) for w in order if errors[:, w].any()]
+    order = np.argsort(-errors.max((0, 1)), kind="stable")[:count]
+    worst = [(w, *np.unravel_index(errors[..., w].argmax(), errors.shape[:2])) for w in order if errors[..., w].any()]
+    return [(episodes.windows[w], episodes.planners[p], int(n)) for w, n, p in worst]
 
 
 def draw_weights(clusters: Int[np.ndarray, "W"], num_draws: int) -> Float[np.ndarray, "D W"]:
@@ -183,42 +185,46 @@ def compute_r_squared(x: Float[np.ndarray, "*n P"], y: Float[np.ndarray, "*n P"]
 
 
 def measure_agreement(
-    values: Float[np.ndarray, "T P W"], mask: Bool[np.ndarray, "P W"], weights: Float[np.ndarray, "D W"]
+    values: Float[np.ndarray, "N T P W"], mask: Bool[np.ndarray, "P W"], weights: Float[np.ndarray, "D W"]
 ) -> dict[str, Float[np.ndarray, "D T"]]:
     """Statistics of a score in each traffic against the truth.
 
     planner_error: mean over planners of the error of a planner's mean; bias: the same with signs; episode_error: mean
-    error of an episode; changed: fraction of episodes off by more than 0.05; tau_b and r_squared of planners' means.
-    Planners without an episode that counts are left out.
+    error of an episode, in which rollouts do not cancel; changed: fraction of episodes off by more than 0.05; tau_b and
+    r_squared of planners' means. Planners without an episode that counts are left out.
 
     Args:
         values: Score of each episode.
         mask: True = the episode counts.
         weights: Weights of the windows.
     """
-    values, mask = values[:, mask.any(1)], mask[mask.any(1)]
-    means = average(values, mask, weights)
-    difference, error = means - means[:, :1], np.abs(values - values[:1])
+    values, mask = values[:, :, mask.any(1)], mask[mask.any(1)]
+    means = average(values.mean(0), mask, weights)
+    difference, error = means - means[:, :1], np.abs(values - values[:, :1])
     truth = np.broadcast_to(means[:, :1], means.shape)
     return {
         "planner_error": np.abs(difference).mean(-1),
         "bias": difference.mean(-1),
-        "episode_error": pool(error, mask, weights),
-        "changed": pool((error > CHANGED).astype(float), mask, weights),
+        "episode_error": pool(error.mean(0), mask, weights),
+        "changed": pool((error > CHANGED).mean(0), mask, weights),
         "tau_b": compute_tau_b(truth, means),
         "r_squared": compute_r_squared(truth, means),
     }
 
 
-def count_failures(is_failure: Bool[np.ndarray, "T P W"], mask: Bool[np.ndarray, "P W"]) -> list[tuple[int, int, int]]:
-    """Episodes that fail in both, in the truth alone, and in the traffic alone, for each type of traffic.
+def count_failures(
+    is_failure: Bool[np.ndarray, "N T P W"], mask: Bool[np.ndarray, "P W"]
+) -> list[tuple[float, float, float]]:
+    """Episodes that fail in both, in the truth alone, and in the traffic alone, for each type of traffic; means over
+    rollouts.
 
     Args:
         is_failure: True = the planner is at fault for a collision.
         mask: True = the episode counts.
     """
-    truth, failed = is_failure[0] & mask, is_failure & mask
-    return [(int((t & truth).sum()), int((truth & ~t).sum()), int((t & ~truth).sum())) for t in failed]
+    truth, failed = is_failure[:, :1] & mask, is_failure & mask
+    tables = (failed & truth, truth & ~failed, failed & ~truth)
+    return list(zip(*(table.sum((2, 3)).mean(0).tolist() for table in tables)))
 
 
 def find_interval(draws: Float[np.ndarray, "D"], level: float = 0.95) -> tuple[float, float, float]:

@@ -67,7 +67,8 @@ def list_rows(episodes: Episodes, cells: Callable[[int], Sequence[str]]) -> tupl
 
 def pool_errors(episodes: Episodes, mask: Bool[np.ndarray, "P W"]) -> list[Float[np.ndarray, "D T"]]:
     """Errors of an episode's score and hit rate, over the measured episodes of a mask."""
-    errors = [np.abs(episodes.values[column] - episodes.values[column][:1]) for column in (SCORE, HIT)]
+    tables = [episodes.values[column] for column in (SCORE, HIT)]
+    errors = [np.abs(values - values[:, :1]).mean(0) for values in tables]
     return [pool(error, mask & episodes.is_measured, episodes.weights) for error in errors]
 
 
@@ -86,12 +87,13 @@ def build_error_table(windows: WindowSet) -> TextTable:
 
     def format_errors(t: int) -> list[str]:
         cells = [format_cell(table[:, t], sign="+" * (label == "bias")) for label, table in zip(columns, tables)]
-        return [*cells, " · ".join(map(str, failures[t]))]
+        return [*cells, " · ".join(f"{count:g}" for count in failures[t])]
 
     note = (
         f"{len(episodes.windows)} windows of {len({*episodes.networks})} networks × {len(episodes.planners)} planners; "
-        f"rollouts in learned traffic: {episodes.num_rollouts}. Errors against the truth; 95 % intervals by bootstrap "
-        "over networks, whose draws make absolute errors of means larger. Failures: at fault in both · missed · false."
+        f"rollouts in traffic with a model: {len(episodes.values[SCORE])}. Errors against the truth; 95 % intervals by "
+        "bootstrap over networks, whose draws make absolute errors of means larger. "
+        "Failures: at fault in both · missed · false."
     )
     return TextTable(f"Errors, {windows.name}", ("", *columns, "failures"), list_rows(episodes, format_errors), note)
 
@@ -124,16 +126,16 @@ def build_parts_table(
     return TextTable(title, ("", *headings), rows, "Error of the score · error of the hit rate of an episode.")
 
 
-def list_distances(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
+def split_by_distance(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
     """Episodes by the planner's distance from the log after 8 s in the truth."""
-    distance = episodes.values["distance_m"][0]
+    distance = episodes.values["distance_m"][0, 0]
     return [
         (f"{low:g}–{high:g} m" if np.isfinite(high) else f"> {low:g} m", (distance >= low) & (distance < high))
         for low, high in pairwise(DISTANCES_M)
     ]
 
 
-def list_conflicts(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
+def split_by_conflict(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"]]]:
     """Episodes by the conflicts of their windows, which may have several."""
     names = (*VEHICLE_CONFLICTS, "pedestrian")
     masks = [(name, np.array([name in conflicts for conflicts in episodes.conflicts])) for name in names]
@@ -144,7 +146,7 @@ def list_conflicts(episodes: Episodes) -> list[tuple[str, Bool[np.ndarray, "P W"
 def build_planner_table(windows: WindowSet, column: str) -> TextTable:
     """Mean of a score by planner and traffic."""
     episodes = windows.episodes
-    means = average(episodes.values[column], episodes.is_measured, episodes.weights)[0]
+    means = average(episodes.values[column].mean(0), episodes.is_measured, episodes.weights)[0]
     rows = [(name, *(f"{mean:.3f}" for mean in means[t])) for t, name in enumerate(episodes.traffic)]
     return TextTable(f"{column}, {windows.name}", ("", *episodes.planners), tuple(rows))
 
@@ -162,8 +164,8 @@ def list_verdicts(sets: Sequence[WindowSet], models: Sequence[str], ghost: str) 
         episodes = windows.episodes
         if ghost in episodes.traffic:
             row = episodes.traffic.index(ghost)
-            error = np.abs(episodes.values[SCORE][row] - episodes.values[SCORE][0])[episodes.is_measured]
-            hits = (episodes.values[HIT][row] != episodes.values[HIT][0])[episodes.is_measured]
+            score, hit_rate = (episodes.values[column][0][:, episodes.is_measured] for column in (SCORE, HIT))
+            error, hits = np.abs(score[row] - score[0]), hit_rate[row] != hit_rate[0]
             lines.append(
                 f"{windows.name}: reaction moves the score by more than {CHANGED} in {int((error > CHANGED).sum())} of "
                 f"{len(error)} episodes, and who is hit in {int(hits.sum())}."
@@ -199,7 +201,7 @@ def draw_figure(sets: Sequence[WindowSet], shown: Sequence[str]) -> Figure:
     for row, windows in enumerate(sets):
         episodes = windows.episodes
         for axis, (column, label) in zip(axes[row], ((SCORE, "nuPlan-style score"), (HIT, "hit rate"))):
-            means = average(episodes.values[column], episodes.is_measured, episodes.weights)  # [D, T, P]
+            means = average(episodes.values[column].mean(0), episodes.is_measured, episodes.weights)  # [D, T, P]
             drawn = means[1:] if np.isfinite(means[1:]).any() else means[:1]  # a single network has no draws
             low, high = np.nanquantile(drawn, (0.025, 0.975), axis=0)
             for color, name in zip(COLORS, shown):
@@ -236,12 +238,12 @@ def write_report(episodes: Episodes, models: Sequence[str], out: Path, *, ghost:
     sets = choose_sets(episodes)
     episodes = sets[0].episodes
     values = episodes.values
-    is_seen = values["off_lane_steps"][0] == 0
+    is_seen = values["off_lane_steps"][0, 0] == 0
     seen_tables = pool_errors(episodes, is_seen)
     tables = [build_error_table(windows) for windows in sets] + [build_paired_table(windows) for windows in sets]
     tables += [
-        build_parts_table(sets[0], "By distance from the log after 8 s", list_distances(episodes)),
-        build_parts_table(sets[0], "By conflict at the current step", list_conflicts(episodes)),
+        build_parts_table(sets[0], "By distance from the log after 8 s", split_by_distance(episodes)),
+        build_parts_table(sets[0], "By conflict at the current step", split_by_conflict(episodes)),
         TextTable(
             f"Without the {np.mean(~is_seen):.0%} of episodes with steps at which the ego is on no lane of SUMO",
             ("", "score of an episode", "hit rate of an episode"),
@@ -251,7 +253,7 @@ def write_report(episodes: Episodes, models: Sequence[str], out: Path, *, ghost:
         TextTable(
             "CPU seconds of an episode in this process; SUMO's own come on top",
             ("", "mean"),
-            tuple((name, f"{np.nanmean(values['seconds'][t]):.2f}") for t, name in enumerate(episodes.traffic)),
+            tuple((name, f"{np.nanmean(values['seconds'][:, t]):.2f}") for t, name in enumerate(episodes.traffic)),
         ),
     ]
     lines = list_verdicts(sets, models, ghost)

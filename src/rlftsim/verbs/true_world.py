@@ -18,7 +18,7 @@ def true_world(
     shifts: tuple[float, ...] = (0.1,),
     limit: int | None = None,
     conflict_windows: int = 0,
-    rollouts: int = 1,
+    num_rollouts: int = 1,
     films: int = 0,
     seed: int = 0,
     jobs: int = 1,
@@ -41,9 +41,9 @@ def true_world(
         shifts: Meters by which the world's drivers see the ego ahead of its place: the floor of every error.
         limit: Number of windows, one of each network in turn; left out, all of them.
         conflict_windows: Windows with a conflict of vehicles to drive, of those after the limit if it has too few.
-        rollouts: Rollouts of each episode in the traffic of models, whose mean counts.
+        num_rollouts: Rollouts of each episode in traffic with a model, IDM included, whose pedestrians a model drives.
         films: Windows to film for OUT/films.html, those in which the last of the models errs most about a planner's
-            score: the world, that model, replay and IDM side by side.
+            score: the world, that model, replay and IDM side by side. Driven again by each call, in a single process.
         seed: Seed of the traffic.
         jobs: Processes, each with one thread. Changes no result.
         work: Machines that share the work.
@@ -54,14 +54,14 @@ def true_world(
     from rlftsim.envs.true_world_films import write_films
     from rlftsim.envs.true_world_traffic import Surroundings
     from rlftsim.experiments.true_world import arrange_episodes, find_largest_errors
-    from rlftsim.experiments.true_world_report import SCORE, write_report
+    from rlftsim.experiments.true_world_report import REFERENCES, SCORE, write_report
 
     learned = list(map(Surroundings.parse, filter(None, models.split(","))))
     if whole_number("films", films, 0) and not learned:
         raise ConfigError("films show where a model errs: name one with --models.")
     chosen = tuple(PLANNERS) if planners == ALL else tuple(name.strip() for name in planners.split(","))
     surroundings = (TRUTH, GHOST, *RULES, *map(shift_truth, shifts), *learned)
-    config = TrueWorldConfig(data, surroundings, chosen, seed, limit, conflict_windows, rollouts)
+    config = TrueWorldConfig(data, surroundings, chosen, seed, limit, conflict_windows, num_rollouts)
     runner = work.runner(jobs, work.on_error) or choose_runner(jobs, len(config.trips))
     table = drive_true_world(config, out, runner)
     episodes = arrange_episodes(table.to_pylist(), TRUTH.name)
@@ -69,5 +69,6 @@ def true_world(
         print_line(f"* {line}")
     if films:
         choices = find_largest_errors(episodes, SCORE, learned[-1].name, films)
-        write_films(config, choices, (TRUTH.name, learned[-1].name, "replay", "idm"), out / "films.html")
+        write_films(config, choices, (TRUTH.name, learned[-1].name, *REFERENCES), out / "films.html")
+        print_line(out / "films.html")
     print_line(out / "report.md")
