@@ -259,7 +259,7 @@ def write_report(episodes: Episodes, models: Sequence[str], out: Path, *, ghost:
     lines = list_verdicts(sets, models, ghost)
     lines.append(
         f"A road user that is no agent of the scenario came within 20 m of the ego in "
-        f"{np.mean(values['num_strangers'][0] > 0):.0%} of the episodes in truth."
+        f"{np.mean(values['num_strangers'][0, 0] > 0):.0%} of the episodes in truth."
     )
     shown = [name for name in (*REFERENCES, "constant velocity", *models) if name in episodes.traffic][: len(COLORS)]
     save_figure(out / "figure.png", draw_figure(sets, shown))
