@@ -15,8 +15,9 @@ from rlftsim.viewer.page import write_page
 def write_films(
     config: TrueWorldConfig, choices: Sequence[tuple[str, str, int]], traffic: Sequence[str], path: Path
 ) -> None:
-    """Write a page of films of single episodes, each in several types of traffic side by side; none that SUMO or the
-    planner does not drive again.
+    """Write a page of films of single episodes, each in several types of traffic side by side.
+
+    An episode in which SUMO or the planner fails this time is left out, with a warning.
 
     Args:
         config: Windows, planners and types of traffic of the rows.
