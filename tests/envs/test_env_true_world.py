@@ -13,8 +13,10 @@ from rlftsim.envs import conflicts, sumo_traffic, true_world
 from rlftsim.envs.conflicts import CROSSING, FOLLOWING, MERGING, PEDESTRIAN, find_conflicts
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.true_world import GHOST, TRUTH, TrueWorldConfig
+from rlftsim.envs.true_world_episode import Trip
 from rlftsim.envs.true_world_traffic import Surroundings
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.generate import generate
 from rlftsim.scenario.types import MapFeatureType, ObjectType
@@ -91,6 +93,17 @@ def test_conflict_windows_are_added_to_random_ones_until_there_are_enough(limit,
     config = TrueWorldConfig("data", (TRUTH,), ("log",), limit=limit, conflict_windows=wanted)
     assert " ".join(trip.window for trip in config.trips) == windows
     assert [trip.is_random for trip in config.trips] == [k < (limit or 4) for k in range(len(config.trips))]
+
+
+def test_planners_whose_episodes_would_share_a_file_are_refused(tmp_path, monkeypatch):
+    trips = [Trip("data", "a0", "a", TRUTH, planner, 0) for planner in ("mine:Fast", "mine.Fast")]
+    monkeypatch.setattr(TrueWorldConfig, "trips", trips)
+    monkeypatch.setattr(true_world, "hash_manifest", lambda folder: "0")
+    monkeypatch.setattr(true_world, "hash_code", lambda planner: "0")
+    monkeypatch.setattr(true_world, "dataset_folder", Path)
+    config = TrueWorldConfig("data", (TRUTH,), ("log",))
+    with pytest.raises(ConfigError, match=r"^a0-truth-mine\.Fast names two episodes: .*leave one out\.$"):
+        true_world.drive_true_world(config, tmp_path / "out", Inline())
 
 
 @pytest.mark.skipif(

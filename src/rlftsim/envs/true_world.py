@@ -129,9 +129,10 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
         }
         for trip in trips
     }  # fmt: skip
-    if len(identity) < len(trips):
-        raise ConfigError("two planners or models have names that differ in signs alone: leave one out.")
     names = [trip.name for trip in trips]
+    if len(identity) < len(names):
+        doubled = next(name for name in names if names.count(name) > 1)
+        raise ConfigError(f"{doubled} names two episodes: planners or models differ in signs alone, leave one out.")
     format = ScenarioValues(out / "episodes", names, identity, read_row)
     rows = measure_scenarios("episodes", partial(_drive_trip, trips), format, runner=runner)
     # a window is random or chosen by this call's settings, and the files serve others, too

@@ -8,6 +8,7 @@ networks.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -88,10 +89,10 @@ def arrange_episodes(rows: Sequence[Mapping[str, Any]], truth: str) -> Episodes:
         raise DataError("no window was driven by all planners in all traffic: go on with the run.")
     first = [next(iter(by_window[name].values())) for name in windows]
     columns = [name for name, value in first[0].items() if isinstance(value, float)]
-    keys = [[[(n, t, p) for p in planners] for t in traffic] for n in range(num_rollouts)]
+    shape = (num_rollouts, len(traffic), len(planners), len(windows))
+    keys = list(product(range(num_rollouts), traffic, planners, windows))
     values = {
-        column: np.array([[[[by_window[w][key][column] for w in windows] for key in k] for k in part] for part in keys])
-        for column in columns
+        column: np.array([by_window[w][n, t, p][column] for n, t, p, w in keys]).reshape(shape) for column in columns
     }
     networks = tuple(row["network"] for row in first)
     conflicts = tuple(frozenset(row["conflicts"].split()) for row in first)
