@@ -19,7 +19,7 @@ from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogr
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
-from rlftsim.jobs.files import remove_folder, write_atomically, write_text
+from rlftsim.jobs.files import remove_folder, remove_temporaries, write_atomically, write_text
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Joining, Runner, Share, choose_runner
@@ -110,6 +110,7 @@ def write_files(
             format=WholeFiles(folder, itemgetter(0), _read_page),
         )  # fmt: skip
         files = [file for file in finished if file.stat().st_size]
+        remove_temporaries(out / name for name in items)  # of a process that was killed at this very copy
         for file in files:
             write_atomically(out / file.name, partial(shutil.copyfile, file))
         lease.remove()
