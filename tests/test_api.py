@@ -218,7 +218,7 @@ def test_3_a_run_folder_is_as_good_as_its_model_folder(home):
 
 
 def test_4_the_synthetic_data_set_is_known_by_name():
-    assert len(rs.load_dataset("synthetic")) == 200
+    assert len(rs.load_dataset("synthetic")) == 240
     assert len(rs.load_dataset("synthetic", "validation")) == 40
 
 

@@ -73,8 +73,8 @@ def test_scenarios_are_found_by_position_and_id(folder):
 
 def test_a_folder_may_be_a_text_and_the_embedded_data_set_has_a_name(folder):
     assert ScenarioDataset(str(folder)).scenario_ids == ScenarioDataset(folder).scenario_ids
-    assert len(ScenarioDataset("synthetic")) == 200
-    assert read_manifest("synthetic").counts == {"training": 160, "validation": 40}
+    assert len(ScenarioDataset("synthetic")) == 240
+    assert read_manifest("synthetic").counts == {"testing": 40, "training": 160, "validation": 40}
 
 
 def test_a_split_shows_only_its_scenarios(folder):

@@ -25,7 +25,7 @@ def test_synthetic_scenarios_are_of_the_networks_of_their_shards():
     held_out = ScenarioDataset("synthetic", "validation")
     assert len(held_out) == len(held_out.clusters) == 40
     assert sorted(set(held_out.clusters)) == ["2026/1/0", "2026/1/1", "2026/1/2", "2026/1/3"]
-    assert len(set(ScenarioDataset("synthetic").clusters)) == 20
+    assert len(set(ScenarioDataset("synthetic").clusters)) == 60
 
 
 def test_windows_of_a_recording_are_one_cluster_and_other_scenarios_are_their_own(tmp_path):

@@ -46,7 +46,7 @@ class DemoConfig:
 
     recipe: Recipe
     data: Path
-    """A data set with the splits training and validation."""
+    """A data set with the split training, and that of the evaluation."""
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     num_played: int = 3
     """Scenarios that play in the report."""

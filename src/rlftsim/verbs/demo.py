@@ -35,7 +35,7 @@ def demo(
     # More processes than this only compete for memory bandwidth on the machines that the demo is made for.
     jobs = min(usable_cores(), 4) if processes == "auto" else processes
     # All rollouts in one pass: so small a model takes a quarter less time with it.
-    evaluation = EvaluateConfig(rollouts_per_pass=32, jobs=jobs)
+    evaluation = EvaluateConfig(split="testing", rollouts_per_pass=32, jobs=jobs)
     config = DemoConfig(
         (recipe if seed is None else recipe.with_seed(seed)).with_processes(processes),
         pack_path(),

@@ -53,10 +53,11 @@ def test_checksums_hold_and_the_pack_is_small():
 
 def test_manifest_tells_how_the_pack_was_made(pack):
     provenance = pack.manifest.provenance
-    assert pack.manifest.counts == {"training": 160, "validation": 40}
+    assert pack.manifest.counts == {"testing": 40, "training": 160, "validation": 40}
     assert provenance["license"] == "CC0-1.0"
     assert provenance["arguments"]["num_scenarios"] == 200
     assert {"seed", "splits"} <= set(provenance["arguments"])
+    assert provenance["testing_arguments"]["splits"] == {"testing": 1.0}
     assert provenance["sumo_version"].count(".") == 2
 
 
@@ -66,8 +67,9 @@ def test_no_two_splits_share_a_network(pack):
     }
     assert len(shards["training"]) == 16
     assert len(shards["validation"]) == 4
+    assert len(shards["testing"]) == 40
     seeds = {tuple(network["seed"]) for network in pack.manifest.provenance["networks"]}
-    assert len(seeds) == 20
+    assert len(seeds) == 60
 
 
 def test_every_ego_is_seen_throughout_and_every_evaluated_agent_now(pack):

@@ -4,8 +4,9 @@ from pathlib import Path
 
 
 def pack_path() -> Path:
-    """Folder of the embedded data set: 200 scenarios, made by `generate` with the arguments in the manifest.
+    """Folder of the embedded data set, made by `generate` with the arguments in the manifest.
 
-    The splits are "training" and "validation"; `ScenarioDataset` opens the folder.
+    Splits: "training" has 160 scenarios of 16 street networks, "validation" 40 of 4, on which choices were made, and
+    "testing" 40 of 40, on which none was made. `ScenarioDataset` opens the folder.
     """
     return Path(__file__).parent / "pack"
