@@ -119,7 +119,7 @@ def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.T
     check_folder(out, "results")
     trips = config.trips
     codes = {name: hash_code(planner_name) for name, planner_name in {(t.planner, t.planner_name) for t in trips}}
-    models = {s.name: fingerprint_policy(load_model(s.model)) for s in config.surroundings if s.traffic == "policy"}
+    models = {s.name: fingerprint_policy(load_model(s.model)) for s in config.surroundings if s.has_model}
     manifest = hash_manifest(dataset_folder(config.data))
     identity = {
         trip.name: {

@@ -35,11 +35,12 @@ def write_films(
             except EpisodeFailure as failure:
                 log.warning(f"no film of {planner} in {window}: {failure}")
                 continue
+            finally:
+                advance()
             scores = (f"{name}: {result.planner.nuplan_style:.2f}" for name, result in zip(traffic, results))
             animation = build_animation(dict(zip(scores, (result.record for result in results))))
             conflicts = ", ".join(sorted(list_conflicts(config.data, window))) or "none"
             caption = f"Conflicts at the current step: {conflicts}. Rollout {rollout}."
             films.append(replace(animation, title=f"{planner} in {window}", caption=caption))
-            advance()
     caption = "The same planner from the same step on; beside each traffic the planner's nuPlan-style score."
     write_page(path, "Windows in which traffic errs most about a planner", films, caption=caption)
