@@ -66,6 +66,27 @@ def test_what_a_living_process_or_another_program_writes_stays(tmp_path):
     assert all((tmp_path / name).exists() for name in others)
 
 
+def test_a_write_removes_what_killed_ones_of_the_same_file_left(tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    host, parent = socket.gethostname(), os.getppid()
+    left, *others = (
+        f".a.json.{host}.{ended.pid}.tmp", f".a.json.{host}.{parent}.tmp", f".b.json.{host}.{ended.pid}.tmp",
+        ".a.json.other-host.7.tmp", ".a.json.123.tmp",
+    )  # fmt: skip
+    for name in (left, *others):
+        (tmp_path / name).touch()
+    write_text(tmp_path / "a.json", "whole")
+    assert names(tmp_path) == sorted([*others, "a.json"])
+
+
+def test_a_folder_that_a_killed_writer_left_is_removed_whole(tmp_path):
+    (tmp_path / ".set.host.12.tmp" / "shards").mkdir(parents=True)
+    (tmp_path / ".set.host.12.tmp" / "shards" / "a").touch()
+    remove_temporaries([tmp_path / "set"])
+    assert names(tmp_path) == []
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc")
 def test_a_temporary_of_a_process_whose_exit_status_nobody_collects_goes(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""], stdout=subprocess.PIPE) as process:

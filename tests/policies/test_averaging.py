@@ -73,8 +73,12 @@ def test_the_command_writes_a_model_folder_with_its_origin(base, tmp_path, capsy
     for name, policy in {"base": base, "a": moved(base, 0.1), "b": moved(base, 0.3)}.items():
         policy.save_pretrained(tmp_path / name, card=f"# Model\n\n* terms of the data: those of {name}\n")
     words = ["model", "average", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "mean")]
+    killed = tmp_path / ".mean.machine.12.tmp"
+    killed.mkdir()
+    (killed / "model.safetensors").write_bytes(b"half")
     assert main([*words, "--base", str(tmp_path / "base"), "--scale", "1.5"]) == 0
     assert difference(load_policy(tmp_path / "mean"), base) == 0.3
+    assert not killed.exists()
     card = (tmp_path / "mean" / "README.md").read_text()
     assert "/a, " in card
     assert f"scale 1.5 from {tmp_path / 'base'}" in card

@@ -184,6 +184,17 @@ def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
     assert contents(tmp_path / "back") == contents(data)
 
 
+def test_a_lease_that_was_cut_short_is_as_old_as_its_file(data, tmp_path):
+    url, lease = f"file://{tmp_path}/there", tmp_path / "there" / ".lease"
+    lease.parent.mkdir()
+    lease.touch()
+    with pytest.raises(NotYetError, match=r"\(unknown, last heard of 0:00:0\d ago\): wait for it"):
+        push_dataset(data, url, show_progress=False)
+    os.utime(lease, (1, 1))
+    push_dataset(data, url, show_progress=False)
+    assert not lease.exists()
+
+
 def test_a_push_that_was_taken_over_leaves_the_new_owner_alone(tmp_path):
     url, other = f"file://{tmp_path}", "other process 1 since 2026-01-01T00:00:00+00:00\n"
     with remote_lease(url) as renew:
@@ -408,5 +419,6 @@ def test_a_pull_removes_what_a_killed_one_was_fetching(data, tmp_path, monkeypat
         with pytest.raises(ZeroDivisionError):
             pull_dataset(f"file://{data}", tmp_path / "back")
     (tmp_path / "back" / ".index.parquet.machine.12.tmp").touch()
+    (tmp_path / "back" / "INCOMPLETE").write_bytes(b"")  # killed while it marked the folder
     pull_dataset(f"file://{data}", tmp_path / "back", show_progress=False)
     assert contents(tmp_path / "back") == contents(data)

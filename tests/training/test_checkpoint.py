@@ -9,7 +9,13 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from rlftsim.errors import CheckpointError, DataError
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+from rlftsim.training.checkpoint import (
+    Progress,
+    newest_checkpoint,
+    read_checkpoint,
+    remove_old_checkpoints,
+    write_checkpoint,
+)
 
 
 def small_run(seed=0, steps=3):
@@ -78,6 +84,18 @@ def test_writing_goes_on_over_what_a_killed_run_left(tmp_path):
     path = write_checkpoint(tmp_path, Progress(4), {"policy": module}, optimizer)
     assert not leftover.exists()
     assert read_checkpoint(path, {"policy": copy.deepcopy(module)}, optimizer).update == 4
+
+
+def test_old_and_half_checkpoints_of_a_killed_run_go(tmp_path):
+    module, optimizer = small_run()
+    for update in (2, 4):
+        write_checkpoint(tmp_path, Progress(update), {"policy": module}, optimizer)
+    shutil.copytree(tmp_path / "update-00000002", tmp_path / "update-00000001")
+    shutil.copytree(tmp_path / "update-00000002", tmp_path / ".partial-update-00000003")
+    (tmp_path / "update-00000001" / "notes.txt").touch()
+    remove_old_checkpoints(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["update-00000001", "update-00000002", "update-00000004"]
+    assert [p.name for p in (tmp_path / "update-00000001").iterdir()] == ["notes.txt"]
 
 
 def test_a_checkpoint_that_does_not_fit_on_the_disk_is_named_and_the_older_one_stays(tmp_path):

@@ -9,6 +9,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 from glob import has_magic
 from pathlib import Path
@@ -353,7 +354,10 @@ def remote_lease(url: str) -> Iterator[Callable[[], object]]:
 
     while not put_text(lease_url, describe_owner(), is_new=True):
         owner, age = parse_owner(get_text(lease_url))
-        owner = owner or "unknown"
+        if not owner:  # killed while it was writing this
+            with remote(lease_url) as (files, path):
+                silence = datetime.now(UTC) - files.modified(path)
+            owner, age = "unknown", timedelta(seconds=max(int(silence.total_seconds()), 0))
         if age.total_seconds() < SECONDS_OF_SILENCE:
             raise NotYetError(
                 f"another process is copying to {url} ({owner}, last heard of {age} ago): wait for it, or remove "

@@ -10,6 +10,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
+from functools import lru_cache
 from pathlib import Path
 
 from safetensors.torch import save
@@ -61,7 +62,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename the file to `path`. A missing folder is created.
 
     A symbolic link stays, and the target of the link is replaced. Devices and pipes stay, too, and receive the finished
-    bytes.
+    bytes. What ended processes of this machine left of the same file is removed.
 
     Args:
         path: File that appears when the content is whole.
@@ -79,6 +80,9 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary = temporary_path(Path(temporary_folder) / target.name)
         try:
             temporary.parent.mkdir(parents=True, exist_ok=True)
+            for name_and_host, process, leftover in _list_temporaries(temporary.parent).pop(target.name, ()):
+                if _is_left(name_and_host, process, {target.name}):
+                    _remove(leftover)
             write(temporary)
             # On disk before it gets the name: after a power cut the name must not stand for an empty file.
             with temporary.open("rb") as file:
@@ -121,11 +125,22 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
 
 
+@lru_cache(maxsize=256)
+def _list_temporaries(folder: Path) -> dict[str, list[tuple[str, int, Path]]]:
+    """Temporary files of this machine in a folder, by the name of the file; listed once, as folders may be large."""
+    temporaries: dict[str, list[tuple[str, int, Path]]] = defaultdict(list)
+    host = f".{socket.gethostname()}"
+    for path in folder.glob(".*.tmp"):
+        if (match := _TEMPORARY.fullmatch(path.name)) and match[1].endswith(host):
+            temporaries[match[1].removesuffix(host)].append((match[1], int(match[2]), path))
+    return temporaries
+
+
 def remove_temporaries(paths: Iterable[Path]) -> None:
-    """Remove temporary files that ended processes left beside files; those of other files stay.
+    """Remove temporary files and folders that ended processes left beside results; those of other results stay.
 
     Args:
-        paths: Files that no other machine is writing now; processes of this machine are asked for.
+        paths: Files or folders that no other machine is writing now; processes of this machine are asked for.
     """
     names: dict[Path, set[str]] = defaultdict(set)
     for path in paths:
@@ -133,7 +148,15 @@ def remove_temporaries(paths: Iterable[Path]) -> None:
     for folder, outputs in names.items():
         for leftover in folder.glob(".*.tmp"):
             if (match := _TEMPORARY.fullmatch(leftover.name)) and _is_left(match[1], int(match[2]), outputs):
-                leftover.unlink(missing_ok=True)
+                _remove(leftover)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it; missing ones are no error."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:
@@ -166,9 +189,10 @@ def remove_folder(folder: Path, names: Collection[str]) -> None:
         folder: May be missing. Files of other names, and inner folders, stay.
         names: Files that the caller has written there.
     """
+    # first: who lists the names by the files that are there would not name these again after a kill in between
+    remove_temporaries(folder / name for name in names)
     for name in names:
         (folder / name).unlink(missing_ok=True)
-    remove_temporaries(folder / name for name in names)
     with suppress(OSError):  # it holds something else, or is gone
         folder.rmdir()
 

@@ -390,10 +390,12 @@ def _finish(folder: Path, new: list[ShardEntry], source: DataSource, note: str |
         for file in entries:
             (folder / file).unlink(missing_ok=True)
             (folder / f"{file}.json").unlink(missing_ok=True)
-        lease.remove()
-        for path in (*sorted((folder / SHARDS).rglob("*"), reverse=True), folder / SHARDS, folder):
+        for path in (*sorted((folder / SHARDS).rglob("*"), reverse=True), folder / SHARDS):
             with suppress(OSError):  # a file, or a folder with one that is not ours
                 path.rmdir()
+        lease.remove()  # before, the same call gives the same answer
+        with suppress(OSError):
+            folder.rmdir()
         causes = [record for entry in new for record in entry.skipped]
         first = f"; first of {len(causes)} causes: {causes[0]}" if causes else ""
         raise DataError(f"not one scenario could be converted{first}")

@@ -39,7 +39,7 @@ import rlftsim
 from rlftsim.errors import ConfigError, DataError, check_types, whole_number
 from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, validate_folder
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import errors_name, write_atomically, write_text
+from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_path, write_atomically, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.shards import (
@@ -353,8 +353,8 @@ def write_dataset(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(f"{folder} is not an empty folder: choose another one or delete it")
     # beside the folder, so that renaming it never crosses file systems
-    temporary = folder.absolute().with_name(f".{folder.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
+    temporary = temporary_path(folder.absolute())
+    remove_temporaries([folder.absolute()])  # of processes that were killed
     try:
         with errors_name(folder):
             (temporary / SHARDS).mkdir(parents=True)

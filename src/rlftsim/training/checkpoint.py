@@ -61,10 +61,16 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
         write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
         remove_folder(target, files)
         partial.rename(target)
-        # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
-        for old in list_checkpoints(folder)[:-NUM_CHECKPOINTS]:
-            remove_folder(old, files)
+        # Only now is an older one expendable.
+        remove_old_checkpoints(folder)
     return target
+
+
+def remove_old_checkpoints(folder: Path) -> None:
+    """Remove all checkpoints of a run but the newest, and what a run that was killed left of others."""
+    # Names are padded with zeros, so their order is that of the updates.
+    for old in (*list_checkpoints(folder)[:-NUM_CHECKPOINTS], *folder.glob(f".partial-{PREFIX}*")):
+        remove_folder(old, [*(path.name for path in old.glob("*.safetensors")), "progress.json"])
 
 
 def newest_checkpoint(folder: Path) -> Path | None:

@@ -20,7 +20,14 @@ from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
+from rlftsim.training.checkpoint import (
+    Progress,
+    newest_checkpoint,
+    parse_update,
+    read_checkpoint,
+    remove_old_checkpoints,
+    write_checkpoint,
+)
 from rlftsim.training.data import find_starts, share_cache
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios
 from rlftsim.training.monitoring import Validator, check_validation
@@ -368,6 +375,9 @@ class TrainingRun:
             learner.policy.load_state_dict(learner.result.state_dict())
         if self.is_first:
             learner.policy.eval().save_pretrained(self.folder.model, card=self.card)
+            # of a run that was killed behind its last checkpoint
+            remove_old_checkpoints(self.folder.checkpoints)
+            self.folder.remove_superseded_best()
         self.folder.finish_trackers("finished")
         return self.folder.model
 

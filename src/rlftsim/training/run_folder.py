@@ -225,7 +225,7 @@ class RunFolder:
         checkpoints = [self._best(parse_update(path)) for path in list_checkpoints(self.checkpoints)]
         needed = {max((path for path in paths if path <= checkpoint), default=None) for checkpoint in checkpoints}
         for path in paths:
-            if path not in needed and path < max(checkpoints):
+            if path not in needed and path < max(checkpoints, default=path):
                 path.unlink(missing_ok=True)
 
     def _best(self, update: int) -> Path:

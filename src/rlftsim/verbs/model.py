@@ -13,7 +13,7 @@ from rlftsim.evaluation.hub_card import read_evaluation, write_hub_card
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import print_line, print_lines
 from rlftsim.policies.averaging import average_policies
-from rlftsim.policies.checkpoint import CARD, find_model, read_card
+from rlftsim.policies.checkpoint import CARD, find_model, read_card, save_new_model
 from rlftsim.policies.hub import FILES, push_files
 from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
 from rlftsim.policies.smart.alpasim_checkpoint import import_alpasim
@@ -49,7 +49,7 @@ def import_model(checkpoint: Path, out: Path, *, vocabulary: Sequence[Path] = ()
     if format == "alpasim" and vocabulary:
         raise ConfigError("--vocabulary has no effect with --from alpasim: its tables are in the folder tokens.")
     imported = import_catk(checkpoint, vocabulary) if format == "catk" else import_alpasim(checkpoint)
-    imported.policy.save_pretrained(out, card=_card(checkpoint, imported, format))
+    save_new_model(imported.policy, out, card=_card(checkpoint, imported, format))
     weights = sum(p.numel() for p in imported.policy.parameters())
     print_line(f"{out}: SMART {imported.size}, {weights} weights, every key accounted for.")
     for note in imported.notes:
@@ -134,7 +134,7 @@ def average_models(models: list[str], out: Path, *, base: str | None = None, sca
     scaled = "" if base is None else f"* scale {scale:g} from {base}\n"
     card = f"# Mean of {len(models)} models\n\n* {', '.join(models)}\n{scaled}"
     card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
-    average.save_pretrained(out, card=append_cards(card, [*models, *filter(None, [base])]))
+    save_new_model(average, out, card=append_cards(card, [*models, *filter(None, [base])]))
     print_line(f"model: {out}")
 
 

@@ -5,7 +5,6 @@ motions.
 """
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -46,9 +45,10 @@ def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *,
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= {PAGE, NUMBERS, PICTURE}):
         raise DataError(f"{folder} is not a report on a vocabulary: name another place with --report.")
     # Written beside the folder and renamed, so that an interruption leaves the earlier report as it was.
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = folder.with_name(f".{folder.name}.partial")
     try:
-        partial.mkdir(parents=True)
+        remove_folder(partial, (PAGE, NUMBERS, PICTURE))  # of a process that was killed
+        partial.mkdir(parents=True, exist_ok=True)
         write_text(partial / PAGE, report_page(classes, vocabulary=vocabulary, data=data))
         write_text(partial / NUMBERS, json.dumps(report_numbers(classes, vocabulary=vocabulary, data=data), indent=1))
         coverage_picture(partial / PICTURE, classes, title=f"{vocabulary}, compared with {data}")

@@ -228,8 +228,8 @@ def generate(
         # 3. Index and manifest.
         entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]
         manifest = write_index_and_manifest(folder, entries, license_note=LICENSE_NOTE, provenance=provenance)
-        marker.unlink()
         lease.remove()
+        marker.unlink()  # last: without it the same call would not come here again
     return manifest
 
 
