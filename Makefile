@@ -4,7 +4,7 @@ export OMP_WAIT_POLICY = PASSIVE
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
-PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 OUT ?= runs/demo
 PYTEST_FLAGS ?=
 
@@ -30,13 +30,16 @@ lint: $(BIN)/.installed-test
 	$(BIN)/ruff check src tests benchmarks docs
 	$(BIN)/ruff format --check src tests benchmarks docs
 
+# pip would compile all of every package in one process, which takes half of the installation; the demo imports a part
 $(BIN)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -e .
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -c "import rlftsim.experiments.demo"
 	touch $@
 
 $(BIN)/.installed-test: $(BIN)/.installed
 	$(PIP) -e ".[test,docs,wheel]"
+	-$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib
 	touch $@
 
 ## static types; pyright and the node that runs it come as wheels
