@@ -36,8 +36,8 @@ QUICK_SUMMARY = (
 )
 
 
-PREDICTED_GAIN = 0.0126, 0.0292
-"""RMM that the next run of smart-demo gains with 95 %, from 15 runs on the exam (benchmarks/fine_tuning.md)."""
+PREDICTED_GAIN = 0.0168, 0.0346
+"""RMM that the next run gains with 95 %, from ten runs: five seeds, two instruction sets (benchmarks/models.md)."""
 
 
 @dataclass(frozen=True)
@@ -137,4 +137,4 @@ def place_gain(gain: float) -> str:
     """Where a gain in RMM lies in the prediction interval of the recipe."""
     low, high = PREDICTED_GAIN
     position = "below" if gain < low else "above" if gain > high else "inside"
-    return f"RMM {low:+.4f} to {high:+.4f}, by 15 runs on other streets; this run's {gain:+.4f} lies {position}"
+    return f"RMM {low:+.4f} to {high:+.4f}, by ten earlier runs; this run's {gain:+.4f} lies {position}"

@@ -37,7 +37,8 @@ def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[
     means_table = build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
     all_tables = (means_table, build_changes_table(result), build_margins_table(result))
     lines = [row.verdict for row in result.rows] + [format_next_run(row) for row in result.rows if len(row.by_run) > 1]
-    lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")
+    if len(config.temperatures) > 1:
+        lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")
     entries = [build_ledger_entry(row, result, config, environment["commit"]) for row in result.rows]
     values = {"exam": result.name, "verdicts": lines, "rows": entries, "environment": environment}
     write_text(result.folder / "exam.json", json.dumps(to_finite(values), indent=1) + "\n")
