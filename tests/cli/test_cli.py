@@ -162,15 +162,15 @@ WRONG = {
     "an unfinished conversion": ("data stats {tmp}/unfinished", "was not finished: run the same convert command again"),
     "an unknown split": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --split tests",
-        "no split 'tests', only training, validation",
+        "no split 'tests', only testing, training, validation",
     ),
     "an unknown split to train on": (
         "tokens --data synthetic --out {tmp}/v --split tests",
-        "no split 'tests', only training, validation",
+        "no split 'tests', only testing, training, validation",
     ),
     "an unknown split to evaluate": (
         "evaluate oracle --data synthetic --out {tmp}/o --split tests",
-        "no split 'tests', only training, validation",
+        "no split 'tests', only testing, training, validation",
     ),
     "an unknown scenario": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --scenario nobody",

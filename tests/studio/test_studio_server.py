@@ -48,7 +48,8 @@ def test_the_session_names_models_and_what_they_can_do(client):
         ("demo-base", False, False), ("goals", True, True)
     ]  # fmt: skip
     assert "not goal-conditioned" in found["models"][0]["note"]
-    assert {one["name"]: one["scenarios"] for one in found["splits"]} == {"training": 160, "validation": 40}
+    counts = {"testing": 40, "training": 160, "validation": 40}
+    assert {one["name"]: one["scenarios"] for one in found["splits"]} == counts
 
 
 def test_a_query_filters_the_index_and_names_a_wrong_column(client):
