@@ -92,6 +92,7 @@ def test_old_and_half_checkpoints_of_a_killed_run_go(tmp_path):
         write_checkpoint(tmp_path, Progress(update), {"policy": module}, optimizer)
     shutil.copytree(tmp_path / "update-00000002", tmp_path / "update-00000001")
     shutil.copytree(tmp_path / "update-00000002", tmp_path / ".partial-update-00000003")
+    (tmp_path / ".partial-update-00000003" / ".policy.safetensors.machine.12.tmp").touch()
     (tmp_path / "update-00000001" / "notes.txt").touch()
     remove_old_checkpoints(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["update-00000001", "update-00000002", "update-00000004"]

@@ -52,8 +52,8 @@ def test_what_goes_wrong_half_way_leaves_the_old_report(classes, tmp_path, monke
     def full(*_, **__):
         raise OSError("no space left on device")
 
-    (tmp_path / ".v.report.partial").mkdir()  # by a process that was killed
-    (tmp_path / ".v.report.partial" / "report.md").touch()
+    (tmp_path / ".v.report.machine.12.tmp").mkdir()  # by a process that was killed
+    (tmp_path / ".v.report.machine.12.tmp" / "report.md").touch()
     monkeypatch.setattr(vocabulary_report, "coverage_picture", full)
     with pytest.raises(DataError, match=r"no space left.*make room"):
         write_vocabulary_report(folder, classes, vocabulary="new", data="two cars")

@@ -62,7 +62,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename the file to `path`. A missing folder is created.
 
     A symbolic link stays, and the target of the link is replaced. Devices and pipes stay, too, and receive the finished
-    bytes. What ended processes of this machine left of the same file is removed.
+    bytes. Temporary files of ended processes of this machine are removed.
 
     Args:
         path: File that appears when the content is whole.
@@ -80,9 +80,9 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary = temporary_path(Path(temporary_folder) / target.name)
         try:
             temporary.parent.mkdir(parents=True, exist_ok=True)
-            for name_and_host, process, leftover in _list_temporaries(temporary.parent).pop(target.name, ()):
-                if _is_left(name_and_host, process, {target.name}):
-                    _remove(leftover)
+            for process, leftover in _list_temporaries(temporary.parent).pop(target.name, ()):
+                if os.name == "posix" and not _is_running(process):  # elsewhere the question ends the process
+                    leftover.unlink(missing_ok=True)
             write(temporary)
             # On disk before it gets the name: after a power cut the name must not stand for an empty file.
             with temporary.open("rb") as file:
@@ -125,14 +125,42 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
 
 
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Folder to be filled, renamed when whole and removed after an error.
+
+    Args:
+        folder: Folder that no other machine is writing now; missing, or empty at the end.
+
+    Raises:
+        DataError: The folder cannot be made, or is not empty.
+    """
+    folder = folder.absolute()
+    temporary = temporary_path(folder)  # beside the folder, so that renaming it never crosses file systems
+    remove_temporaries([folder])  # of processes that were killed
+    try:
+        with errors_name(folder):
+            temporary.mkdir(parents=True)
+        yield temporary
+        with errors_name(folder):
+            if folder.exists():
+                folder.rmdir()
+            temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)  # still there after an error alone
+
+
 @lru_cache(maxsize=256)
-def _list_temporaries(folder: Path) -> dict[str, list[tuple[str, int, Path]]]:
-    """Temporary files of this machine in a folder, by the name of the file; listed once, as folders may be large."""
-    temporaries: dict[str, list[tuple[str, int, Path]]] = defaultdict(list)
+def _list_temporaries(folder: Path) -> dict[str, list[tuple[int, Path]]]:
+    """Processes and temporary files of this machine in a folder, by the name of the file; listed once, as folders may
+    be large.
+    """
+    temporaries: dict[str, list[tuple[int, Path]]] = defaultdict(list)
     host = f".{socket.gethostname()}"
     for path in folder.glob(".*.tmp"):
-        if (match := _TEMPORARY.fullmatch(path.name)) and match[1].endswith(host):
-            temporaries[match[1].removesuffix(host)].append((match[1], int(match[2]), path))
+        match = _TEMPORARY.fullmatch(path.name)
+        if match and match[1].endswith(host) and path.is_file():
+            temporaries[match[1].removesuffix(host)].append((int(match[2]), path))
     return temporaries
 
 
@@ -148,15 +176,10 @@ def remove_temporaries(paths: Iterable[Path]) -> None:
     for folder, outputs in names.items():
         for leftover in folder.glob(".*.tmp"):
             if (match := _TEMPORARY.fullmatch(leftover.name)) and _is_left(match[1], int(match[2]), outputs):
-                _remove(leftover)
-
-
-def _remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it; missing ones are no error."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+                if leftover.is_dir():
+                    shutil.rmtree(leftover, ignore_errors=True)
+                else:
+                    leftover.unlink(missing_ok=True)
 
 
 def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:

@@ -14,7 +14,6 @@ import difflib
 import json
 import os
 import re
-import shutil
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from torch.overrides import TorchFunctionMode
 from rlftsim.errors import CheckpointError, ConfigError, printable
 from rlftsim.jobs.arrays import find_misfits, read_tensors
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import errors_name, remove_temporaries, save_tensors, temporary_path, write_text
+from rlftsim.jobs.files import new_folder, save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.hub import is_hub_url, pull_model
 
@@ -178,17 +177,8 @@ def save_new_model(policy: Any, folder: Path, *, card: str) -> None:
     Raises:
         DataError: The folder cannot be written, such as on a full disk, or is not empty.
     """
-    folder = folder.absolute()
-    partial = temporary_path(folder)
-    with errors_name(folder):
-        remove_temporaries([folder])  # of processes that were killed
-        try:
-            policy.save_pretrained(partial, card=card)
-            if folder.exists():
-                folder.rmdir()
-            partial.replace(folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)  # still there after an error alone
+    with new_folder(folder) as partial:
+        policy.save_pretrained(partial, card=card)
 
 
 def read_model(folder: str | os.PathLike, *, architecture: str | None = None) -> StoredModel:

@@ -20,7 +20,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -39,7 +38,7 @@ import rlftsim
 from rlftsim.errors import ConfigError, DataError, check_types, whole_number
 from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, validate_folder
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_path, write_atomically, write_text
+from rlftsim.jobs.files import new_folder, write_atomically, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.shards import (
@@ -352,23 +351,14 @@ def write_dataset(
     check_folder(folder, "data set")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(f"{folder} is not an empty folder: choose another one or delete it")
-    # beside the folder, so that renaming it never crosses file systems
-    temporary = temporary_path(folder.absolute())
-    remove_temporaries([folder.absolute()])  # of processes that were killed
-    try:
-        with errors_name(folder):
-            (temporary / SHARDS).mkdir(parents=True)
+    # the complete folder gets the name, so no reader ever sees half a data set
+    with new_folder(folder) as partial:
+        (partial / SHARDS).mkdir()
         scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
-        entries = _write_shards(temporary, scenarios, split, scenarios_per_shard)
+        entries = _write_shards(partial, scenarios, split, scenarios_per_shard)
         if not entries:
             raise ConfigError(f"no scenario to write to {folder}: hand over at least one.")
-        write_index_and_manifest(temporary, entries, license_note=license_note, provenance=provenance)
-        # the complete folder is renamed, so no reader ever sees half a data set
-        if folder.exists():
-            folder.rmdir()
-        os.replace(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)  # still there after an error alone
+        write_index_and_manifest(partial, entries, license_note=license_note, provenance=provenance)
     return read_manifest(folder)
 
 

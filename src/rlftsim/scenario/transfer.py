@@ -69,9 +69,8 @@ def pull_dataset(url: str, folder: str | os.PathLike[str], *, show_progress: boo
     check_folder(folder, "data set")
     mark = folder / INCOMPLETE
     note = f"A copy of {url} runs here or was interrupted: run the same command again, it goes on."
-    stored = mark.read_bytes() if mark.is_file() else None
     # the mark itself may be cut short
-    is_begun = stored is not None and (stored.startswith(note.encode()) or note.encode().startswith(stored))
+    is_begun = mark.is_file() and note.encode().startswith(mark.read_bytes()[: len(note.encode())])
     if folder.exists() and not is_begun and any(folder.iterdir()):
         raise DataError(f"{folder} is not empty: choose another folder or delete it")
     manifest = read_manifest(source := mirror(url, (INDEX, MANIFEST)))

@@ -6,6 +6,7 @@ so a folder of that name is never half-written.
 
 import json
 import math
+import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,10 +68,12 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
 
 
 def remove_old_checkpoints(folder: Path) -> None:
-    """Remove all checkpoints of a run but the newest, and what a run that was killed left of others."""
+    """Remove all checkpoints of a run but the newest, and half checkpoints of a killed run."""
     # Names are padded with zeros, so their order is that of the updates.
-    for old in (*list_checkpoints(folder)[:-NUM_CHECKPOINTS], *folder.glob(f".partial-{PREFIX}*")):
+    for old in list_checkpoints(folder)[:-NUM_CHECKPOINTS]:
         remove_folder(old, [*(path.name for path in old.glob("*.safetensors")), "progress.json"])
+    for partial in folder.glob(f".partial-{PREFIX}*"):
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def newest_checkpoint(folder: Path) -> Path | None:

@@ -14,7 +14,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.files import cannot_write, remove_folder, write_text
+from rlftsim.jobs.files import errors_name, new_folder, remove_folder, write_text
 from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
 from rlftsim.viewer.figure import COLORS, INK, save_figure
 
@@ -45,19 +45,11 @@ def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *,
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= {PAGE, NUMBERS, PICTURE}):
         raise DataError(f"{folder} is not a report on a vocabulary: name another place with --report.")
     # Written beside the folder and renamed, so that an interruption leaves the earlier report as it was.
-    partial = folder.with_name(f".{folder.name}.partial")
-    try:
-        remove_folder(partial, (PAGE, NUMBERS, PICTURE))  # of a process that was killed
-        partial.mkdir(parents=True, exist_ok=True)
+    with errors_name(folder), new_folder(folder) as partial:
         write_text(partial / PAGE, report_page(classes, vocabulary=vocabulary, data=data))
         write_text(partial / NUMBERS, json.dumps(report_numbers(classes, vocabulary=vocabulary, data=data), indent=1))
         coverage_picture(partial / PICTURE, classes, title=f"{vocabulary}, compared with {data}")
         remove_folder(folder, (PAGE, NUMBERS, PICTURE))
-        partial.replace(folder)
-    except OSError as error:
-        raise cannot_write(folder, error) from None
-    finally:
-        remove_folder(partial, (PAGE, NUMBERS, PICTURE))
 
 
 def report_numbers(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> dict[str, object]:
