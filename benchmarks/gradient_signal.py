@@ -1,16 +1,15 @@
-"""How much rollouts say about the last layers of TrafficBots' vehicles: signal and noise of the reward's gradient.
+"""How much an estimator of the reward's gradient says per second: signal and noise, at the model itself.
 
-python benchmarks/gradient_signal.py DATA MODEL [MODEL ...] [--num-scenarios 120]
+python benchmarks/gradient_signal.py DATA MODEL [--recipe smart-demo] [--num-scenarios 48]
 
-Split training. The gradient of the MLOO objective, credit by agent, over 8 rollouts of each scenario, at the model
-itself. Signal: squared length of its mean over scenarios, less what chance adds; noise: the squared standard error of
-that mean. Both in units of each weight's own deviation over scenarios. A ratio of 1: that many rollouts point as much
-to the right as to anywhere.
+Split training. Signal: squared length of the mean gradient over scenarios, less what chance adds; noise: the squared
+standard error of that mean. Both in units of each weight's own deviation over scenarios. A ratio of 1: so many rollouts
+point as much to the right as to anywhere. The estimators take turns scenario by scenario, on one core.
 """
 
 import argparse
+import time
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -21,62 +20,72 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.policies.trafficbots.scene import VEHICLE
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.training.config import DeviceConfig
+from rlftsim.scenario.open import open_dataset
+from rlftsim.training.config import DeviceConfig, FinetuneConfig
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.reward import prepare, update_policy
 
+MEASURED = dict(batch_size=1, micro_batch_size=1, constraints=(), learning_rate=1e-30, weight_decay=0.0)
+PAPER = dict(credit="rollout", num_rollouts=8, num_scored=None, credit_clip=None, imitation_weight=0.0)
+BY_AGENT = dict(PAPER, credit="agent", credit_mixing=0.1)
+
 
 def main() -> None:
-    """A line for each output of the layer."""
+    """A line for each estimator."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("models", nargs="+")
-    parser.add_argument("--num-scenarios", type=int, default=120)
+    parser.add_argument("data")
+    parser.add_argument("model")
+    parser.add_argument("--recipe", default="smart-demo")
+    parser.add_argument("--num-scenarios", type=int, default=48)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    scenarios = ScenarioDataset(arguments.data, "training")
-    for name in arguments.models:
-        by_layer = gradients(name, scenarios, min(arguments.num_scenarios, len(scenarios)))
-        for output, samples in by_layer.items():
-            signal, noise, error = signal_and_noise(samples)
-            ratio = signal / noise
-            print(f"{name}, {output}: signal {signal:.4f} ± {error:.4f}, noise {noise:.4f}, ratio {ratio:.2f}")
+    scenarios = open_dataset(arguments.data, "training")
+    count = min(arguments.num_scenarios, len(scenarios))
+    recipe = replace(recipe_by_name(arguments.recipe).finetune, **MEASURED)
+    estimators = {
+        "reward of the rollout, 8 rollouts (the paper's)": replace(recipe, **PAPER, log_prob_reduction="mean"),
+        "reward of the agent, 8 rollouts": replace(recipe, **BY_AGENT, log_prob_reduction="mean"),
+        "the same with imitation 0.002": replace(
+            recipe, **{**BY_AGENT, "imitation_weight": 0.002}, log_prob_reduction="mean"
+        ),
+        f"{arguments.recipe}": replace(recipe, imitation_weight=0.0),
+    }
+    measured = {name: ([], []) for name in estimators}
+    with progress_bar(arguments.model, count) as advance:
+        for index in range(count):
+            for name, config in estimators.items():
+                gradient, seconds = measure_gradient(arguments.model, scenarios[index], config)
+                measured[name][0].append(gradient)
+                measured[name][1].append(seconds)
+            advance()
+    for name, (gradients, seconds) in measured.items():
+        signal, noise, error = signal_and_noise(torch.stack(gradients))
+        rate = 1000 * signal / noise / sum(seconds)
+        rollouts = count * estimators[name].num_rollouts
+        print(
+            f"{name}: signal / noise {signal / noise:.3f} ± {error / noise:.3f} of {rollouts} rollouts; "
+            f"{1000 * sum(seconds) / rollouts:.0f} ms a rollout; {rate:.2f} per 1000 s of CPU"
+        )
 
 
-def gradients(model: str, scenarios: ScenarioDataset, count: int) -> dict[str, Tensor]:
-    """Gradient of each scenario's rollouts for the layers of acceleration and yaw rate; the model stays as it is.
+def measure_gradient(model: str, scenario: object, config: FinetuneConfig) -> tuple[Tensor, float]:
+    """Gradient [weights] of one scenario's rollouts, and the CPU seconds; the model stays as it is.
 
     Args:
-        model: path or name of a TrafficBots model.
-        scenarios: with their futures.
-        count: scenarios used, from the first.
-
-    Returns:
-        By output, [scenarios, weights].
+        model: Path or name of the model; of TrafficBots only the layers of the vehicles' acceleration count.
+        scenario: Scenario with its future.
+        config: Settings of the estimator.
     """
-    config = replace(
-        recipe_by_name("trafficbots-demo").finetune, batch_size=1, num_rollouts=8, rollouts_per_pass=8,
-        trained="decoder", hold_speed=False, learning_rate=1e-30, weight_decay=0.0, gradient_clip=1e9,
-    )  # fmt: skip
     fabric = start_fabric(DeviceConfig(accelerator="cpu", processes=1))
     policy = load_policy(model)
-    assert isinstance(policy, TrafficBotsPolicy)
     learner = prepare(policy, config, fabric.device)
-    head = policy.network.actions
-    layers = {"acceleration": head.acceleration[VEHICLE], "yaw rate": head.yaw_rate[VEHICLE]}
-    policy.requires_grad_(False)  # what is not measured costs no backward pass
-    for layer in layers.values():
-        layer.requires_grad_(True)
-    found: dict[str, list[Tensor]] = {output: [] for output in layers}
-    with progress_bar(model, count) as advance:
-        for index in range(count):
-            update_policy(learner, collate([scenarios[index]]), config, fabric)
-            for output, layer in layers.items():
-                parts = [p.grad.flatten() for p in layer.parameters() if p.grad is not None]  # weight and bias
-                found[output].append(torch.cat(parts).double())
-            advance()
-    return {output: torch.stack(samples) for output, samples in found.items()}
+    if isinstance(policy, TrafficBotsPolicy):
+        policy.requires_grad_(False)  # what is not measured costs no backward pass
+        policy.network.actions.acceleration[VEHICLE].requires_grad_(True)
+    start = time.process_time()
+    update_policy(learner, collate([scenario]), config, fabric)
+    seconds = time.process_time() - start
+    return torch.cat([p.grad.flatten() for p in policy.parameters() if p.grad is not None]), seconds
 
 
 def signal_and_noise(samples: Tensor) -> tuple[float, float, float]:
@@ -85,12 +94,14 @@ def signal_and_noise(samples: Tensor) -> tuple[float, float, float]:
     Args:
         samples: [scenarios, weights].
     """
-    units = samples / samples.std(0).clamp(min=1e-30)
-    count, mean = len(units), units.mean(0)
-    covariance = units.T.cov() / count  # of the mean
-    noise = covariance.trace()
-    error = (2 * covariance.square().sum() + 4 * mean @ covariance @ mean).sqrt()
-    return float(mean @ mean - noise), float(noise), float(error)
+    units = (samples / samples.std(0).clamp(min=1e-30)).double()
+    count = len(units)
+    products = units @ units.T  # of scenarios
+    squares, total = float(products.diagonal().sum()), float(products.sum())
+    signal = (total - squares) / (count * (count - 1))
+    noise = (squares - total / count) / (count * (count - 1))
+    apart = (products - signal).fill_diagonal_(0.0)
+    return signal, noise, float((2 * apart.square().sum()).sqrt()) / (count * (count - 1))
 
 
 if __name__ == "__main__":

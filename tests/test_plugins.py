@@ -219,6 +219,7 @@ def test_what_its_users_refuse_is_listed_as_failing(tmp_path, capsys):
             r"method 'bad' has no settings and no title and no start and no update: make it",
         ),
         "rlftsim.features": ("five", r"feature 'bad' is of type int: decorate it with register_feature"),
+        "rlftsim.constraints": ("five", r"constraint 'bad' is of type int: decorate it with register_constraint"),
         "rlftsim.planners": ("five", r"planner 'bad' is of type int: give it reset\(info\) and act\(observation\)"),
         "rlftsim.experiments": (
             "five",

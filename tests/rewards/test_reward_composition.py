@@ -185,7 +185,7 @@ def test_all_rewards_together_measure_a_rollout_once(credit, measured, monkeypat
 
     monkeypatch.setattr(meta_metric, "compute_features", counted)
     config = FinetuneConfig(reward=EVERYTHING, credit=credit)
-    realism, rewards = compute_reward(scenarios, rollouts, config)
+    realism, rewards, _ = compute_reward(scenarios, rollouts, config)
     assert len(calls) == scenarios.num_scenarios
     assert rewards.by_agent.shape == scenarios.agent_mask[:, None].expand(-1, 4, -1).shape
     torch.testing.assert_close(realism.meta_metric, measured[0].meta_metric)

@@ -14,15 +14,14 @@ from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.training.calibrate import (
-    CONSTRAINTS,
     CalibrationLearner,
-    Constraint,
     best_length,
     natural_direction,
     split_scenarios,
     t_value,
 )
 from rlftsim.training.config import FEATURES, CalibrateConfig
+from rlftsim.training.constraints import Constraint, constraint_by_name
 from rlftsim.training.run import train_policy
 
 CONFIG = CalibrateConfig(
@@ -60,9 +59,10 @@ def expected_value_and_gradient(constraint, eta, num_agents, num_rollouts=3):
 
 
 @pytest.mark.parametrize(
-    ("constraint", "num_agents"), [(CONSTRAINTS["speed"], 2), (CONSTRAINTS["min_ade"], 1)], ids=["mean", "minimum"]
+    ("name", "num_agents"), [("speed", 2), ("min_ade", 1)], ids=["mean", "minimum"]
 )
-def test_credit_times_score_function_is_the_gradient_of_the_expected_value(constraint, num_agents):
+def test_credit_times_score_function_is_the_gradient_of_the_expected_value(name, num_agents):
+    constraint = constraint_by_name(name)
     (high, _), (low, _) = (expected_value_and_gradient(constraint, eta, num_agents) for eta in (0.2 + 1e-4, 0.2 - 1e-4))
     _, gradient = expected_value_and_gradient(constraint, 0.2, num_agents)
     assert gradient == pytest.approx((high - low) / 2e-4, rel=1e-5)
@@ -203,13 +203,17 @@ def test_the_policy_must_have_the_features_of_the_settings(policy, drawn_scenari
         train_policy(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, features=("speed_slow",)))
 
 
+def test_an_unknown_constraint_is_refused_before_the_first_rollout(policy, drawn_scenarios, tmp_path):
+    with pytest.raises(ConfigError, match="unknown constraint 'sped': did you mean 'speed'"):
+        train_policy(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, constraints=("sped",)))
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
         ({"num_rollouts": 1}, "at least 2 rollouts"),
         ({"held_back": 1.0}, "a fraction between 0 and 1"),
         ({"lengths": ()}, "at least one"),
-        ({"constraints": ("comfort",)}, "there are speed"),
         ({"reward": "mlo"}, "did you mean 'mloo'"),
     ],
 )
@@ -228,5 +232,5 @@ def test_the_direction_and_its_length_come_from_different_scenarios():
 
 def test_a_least_value_stays_without_any_rollout_but_the_least():
     parts = torch.tensor([[[1.0, 2.0], [4.0, 0.0], [5.0, 5.0]]])  # sums 3, 4, 10
-    credit = Constraint(lambda *_: parts, is_minimum=True).credit(parts)
+    credit = Constraint(lambda *_: parts, 0.1, is_minimum=True).credit(parts)
     assert credit[0].tolist() == [[1.0 - 4.0, 2.0 - 0.0], [0.0, 0.0], [0.0, 0.0]]

@@ -235,7 +235,13 @@ def log_prob_under(policy, experience, goals):
 
 def test_under_its_own_goal_nothing_is_likelier(policy, experience, fabric, monkeypatch):
     """Rollouts that are scored again under their own goals: a ratio of exactly 1, in an update."""
-    monkeypatch.setattr(hindsight, "relabel_with_hindsight", lambda experiences, terms: list(experiences))
+
+    def keep_goals(experiences, terms):
+        """The rollouts as they were sampled."""
+        relabelled = relabel_with_hindsight(experiences, terms)
+        return [replace(entry, rollouts=one.rollouts) for entry, one in zip(relabelled, experiences)]
+
+    monkeypatch.setattr(hindsight, "relabel_with_hindsight", keep_goals)
     config = replace(CONFIG, goals=GoalConfig(probability=1.0, hindsight=1.0), rollouts_per_pass=2)
     learner = prepare(copy.deepcopy(policy), config, fabric.device)
     values = update_policy(learner, experience.batch, config, fabric)
@@ -284,8 +290,8 @@ def test_hindsight_counts_as_often_as_it_is_likelier(policy, experience, fabric)
     decides = rollouts.decision_mask.any(-1)
     weight = 0.5 * ratio / ratio[decides].mean()
     loss = 0.0
-    assert other.rewards.by_agent.abs().max() > 0
-    for seen, earned in ((rollouts, sampled.rewards.by_agent), (other.rollouts, weight * other.rewards.by_agent)):
+    assert other.reward.abs().max() > 0
+    for seen, earned in ((rollouts, sampled.rewards.by_agent), (other.rollouts, weight * other.reward)):
         log_prob = start.score(start.encode(batch), seen).log_prob(rollouts.decision)
         by_agent = agent_log_prob(log_prob, rollouts.decision_mask, "mean")
         loss = loss - (earned * by_agent).sum() / batch.num_scenarios

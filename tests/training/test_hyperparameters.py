@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
 from rlftsim.recipes.smart import smart_demo_rlftsim, smart_tiny_rlftsim
 
@@ -56,8 +57,9 @@ def test_every_metric_of_a_run_is_explained(measured):
 
     scores, rollouts, batch, _ = measured
     rewards = compute_rewards(parse_reward("mloo"), scores, rollouts, batch)
+    no_credits = torch.zeros(0, *rollouts.heading.shape[:3], dtype=torch.float64)
     names = {
-        *describe_scenarios(Experience(batch, rollouts, scores, rewards)),
+        *describe_scenarios(Experience(batch, rollouts, scores, rewards, no_credits)),
         *(monitor.alarm for monitor in DRIFT_MONITORS),
     }
     explained = set(re.findall(r"`(\w+)`", PAGE.read_text()))

@@ -286,7 +286,8 @@ def test_counts_of_larger_pieces_are_bounded(vocabulary, batch):
         with device.count() as counts:
             reward.update_policy(learner, batch, config, PretendFabric())
         assert_below(counts, launches=20_000, waits=60, copies=115)
-        reward.update_policy(learner, batch, replace(config, hold_speed=True), PretendFabric())
+        held = replace(config, constraints=("speed", "stops"), num_scored=1)
+        reward.update_policy(reward.prepare(policy, held, DEVICE), batch, held, PretendFabric())
 
 
 def assert_below(counts, launches, waits, copies):

@@ -168,7 +168,7 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
         reward = f"{spec.method}(goal_weight={spec.goals.weight}, kind='{spec.goals.reward_type}')"
         goals = with_goals(recipe.goals)
     epochs = recipe.epochs * spec.epochs_fraction
-    hold_speed = recipe.hold_speed and spec.goals is None  # goals ask for a speed
+    constraints = recipe.constraints if spec.goals is None else ()  # goals ask for a speed
     return replace(
-        recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals, hold_speed=hold_speed
+        recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals, constraints=constraints
     )

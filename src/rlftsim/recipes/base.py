@@ -129,7 +129,7 @@ class Recipe:
         CAT-K and RoaD, if in the recipe, then train the goal-conditioned weights alone.
         """
         # Goals that the recipe has chosen already stay: `with_goals` fills in what is off.
-        finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft", hold_speed=False)
+        finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft", constraints=())
         catk, road = (
             method and replace(method, goal_probability=1.0, trained="goals") for method in (self.catk, self.road)
         )

@@ -79,6 +79,8 @@ class SmartRecipe(Recipe):
         # The goal-conditioned weights start at zero: among the most likely tokens none may lead towards the goal.
         goals = super().with_goals()
         assert isinstance(goals, SmartRecipe)
+        if goals.finetune.num_scored is not None:
+            goals = replace(goals, finetune=replace(_score_all(goals.finetune), imitation_weight=0.002))
         return replace(goals, catk=goals.catk and replace(goals.catk, num_candidates=goals.tokens.num_tokens))
 
 
@@ -120,10 +122,14 @@ def smart_demo_rlftsim() -> SmartRecipe:
             epochs=7.0, batch_size=2, learning_rate=3e-3, warmup_updates=40, gradient_clip=1.0, label_smoothing=0.0,
             max_trained_agents=None, still_weight=0.15, ema_decay=0.99, checkpoint_every=200,
         ),
+        # Many rollouts tell what a scenario's reward depends on, and the few that carry most of it are scored. Speed
+        # has a price, as realism pays for slow driving and a weak model would get slow.
         finetune=FinetuneConfig(
-            epochs=1.0, batch_size=4, num_rollouts=8, rollouts_per_pass=8, learning_rate=3e-4, warmup_updates=5,
-            checkpoint_every=20, kl=KlConfig(target=0.02, initial_beta=0.01), goals=GoalConfig(learning_rate_scale=5.0),
-            credit="agent", imitation_weight=0.002, hold_speed=True,
+            epochs=1.0, batch_size=4, micro_batch_size=4, num_rollouts=32, num_scored=8, rollouts_per_pass=8,
+            learning_rate=3e-4, warmup_updates=5, betas=(0.5, 0.99), ema_decay=0.95, checkpoint_every=20,
+            credit="agent", credit_mixing=0.0, credit_clip=3.0, log_prob_reduction="sum",
+            constraints=("moving_speed", "evaluated_moving_speed", "stops"), goals=GoalConfig(learning_rate_scale=5.0),
+            kl=KlConfig(target=0.02, initial_beta=1.0, horizon=1.0),
         ),
         catk=CatkConfig(**near_log),
         road=RoadConfig(**near_log),
@@ -152,7 +158,7 @@ def smart_demo_long() -> SmartRecipe:
             still_weight=0.15, ema_decay=0.99, trained="all",
         ),
         # A strong base needs smaller steps.
-        finetune=replace(recipe.finetune, epochs=0.5, learning_rate=2e-4, imitation_weight=0.005),
+        finetune=replace(recipe.finetune, epochs=0.5, learning_rate=2e-4),
     )  # fmt: skip
 
 
@@ -163,7 +169,7 @@ def smart_demo_quick() -> SmartRecipe:
         recipe,
         tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
         pretrain=replace(recipe.pretrain, epochs=1.0),
-        finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4),
+        finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4, num_scored=2),
         calibrate=CalibrateConfig(num_scenarios=16, num_rollouts=4),
         catk=recipe.catk and replace(recipe.catk, epochs=0.25, batch_size=4),
         road=recipe.road and replace(recipe.road, epochs=0.25, batch_size=4),
@@ -174,5 +180,12 @@ def smart_demo_quick() -> SmartRecipe:
 def smart_synthetic() -> SmartRecipe:
     """Experiments on the synthetic scenarios: the demo, fine-tuned with the paper's objective alone."""
     recipe = smart_demo_rlftsim()
-    objective = replace(recipe.finetune, imitation_weight=0.0, hold_speed=False)
-    return replace(recipe, method="rlft", finetune=objective)
+    return replace(recipe, method="rlft", finetune=_score_all(recipe.finetune))
+
+
+def _score_all(config: FinetuneConfig) -> FinetuneConfig:
+    """The settings with the paper's estimator, of eight rollouts: experiments and goals were measured with it."""
+    return replace(
+        config, num_rollouts=8, num_scored=None, credit_mixing=0.1, credit_clip=None, log_prob_reduction="mean",
+        constraints=(), kl=KlConfig(target=0.02, initial_beta=0.01), betas=(0.9, 0.999), ema_decay=None,
+    )  # fmt: skip

@@ -83,7 +83,7 @@ def trafficbots_demo_rlftsim() -> TrafficBotsRecipe:
         ),
         finetune=FinetuneConfig(
             epochs=2.4, batch_size=4, micro_batch_size=1, num_rollouts=8, rollouts_per_pass=8, credit="agent",
-            hold_speed=True, trained="head", learning_rate=6e-3, warmup_updates=5, checkpoint_every=16,
-            kl=KlConfig(target=0.05, initial_beta=0.01),
+            constraints=("moving_speed", "evaluated_moving_speed"), trained="head", learning_rate=6e-3,
+            warmup_updates=5, checkpoint_every=16, kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
     )  # fmt: skip

@@ -158,6 +158,17 @@ class Rollouts:
         goals, forced = (states and states.rollouts(selected) for states in (self.goals, self.forced))
         return replace(self, **values, goals=goals, forced=forced)
 
+    def take(self, index: Int64[Tensor, "B M"]) -> "Rollouts":
+        """Rollouts of each scenario by number, in any order; all rollouts of a scenario have the same goals.
+
+        Args:
+            index: Numbers of the rollouts, which may be repeated.
+        """
+        row = torch.arange(len(index), device=index.device)[:, None]
+        values = {name: values[row, index] for name, values in self._collect_tensors().items()}
+        goals = self.goals and self.goals.rollouts(slice(1)).repeat(index.shape[1])
+        return replace(self, **values, goals=goals, forced=None)
+
     def select_scenario(self, row: int, num_agents: int) -> "Rollouts":
         """Rollouts of a single scenario; without the steps that were forced.
 

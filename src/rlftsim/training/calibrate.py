@@ -13,14 +13,14 @@ the signal of all weights of a network is not after tens of thousands. K feature
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError
@@ -32,9 +32,9 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios, list_scenario_ids
-from rlftsim.training.config import CalibrateConfig
+from rlftsim.training.config import CONSTRAINED_MEANS, CalibrateConfig
+from rlftsim.training.constraints import constraint_by_name, credit_constraints
 from rlftsim.training.data import batch_with_futures
-from rlftsim.training.experience import mean_speeds
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 
@@ -63,6 +63,8 @@ class CalibrateMethod(Method[CalibrateConfig]):
     ) -> "CalibrationLearner":
         """Learner of the features' weights; the features have to be those of the settings."""
         check_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), is_rewarded=True)
+        for name in settings.constraints:
+            constraint_by_name(name)
         if tuple(policy.features) != settings.features:
             raise ConfigError(
                 f"the policy has the features {', '.join(policy.features)}, the settings others: make it with "
@@ -96,6 +98,11 @@ def split_scenarios(config: CalibrateConfig, scenario_ids: Sequence[str]) -> tup
     return selected[num_held_back:], selected[:num_held_back]
 
 
+def list_scores(config: CalibrateConfig) -> tuple[str, ...]:
+    """Names of what is measured of each scenario held back: scores, constrained means, KL and number of decisions."""
+    return tuple(dict.fromkeys((*MEASURED, *CONSTRAINED_MEANS, *config.constraints, "kl", "num_decisions")))
+
+
 class Statistics(nn.Module):
     """Measurements of each scenario so far: all that a run resumes from.
 
@@ -117,7 +124,7 @@ class Statistics(nn.Module):
     def __init__(self, num_fitted: int, num_held_back: int, config: CalibrateConfig):
         super().__init__()
         width, num_credits = len(config.features), 1 + len(SUB_SCORES) + len(config.constraints)
-        num_scores = len({*MEASURED, *CONSTRAINTS}) + 2
+        num_scores = len(list_scores(config))
         shapes = {"gradients": (num_fitted, num_credits, width), "fisher": (width, width), "counts": (3,)}
         for name, shape in (shapes | {"scores": (1 + len(config.lengths), num_held_back, num_scores)}).items():
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
@@ -130,10 +137,11 @@ class CalibrationLearner(Learner):
     scenarios: Scenarios
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.fitted_ids, self.held_back_ids = split_scenarios(self.config, list(list_scenario_ids(self.scenarios)))
         self.statistics = Statistics(len(self.fitted_ids), len(self.held_back_ids), self.config)
         self.start = self.policy.eta.detach().clone()
-        self.names = tuple(dict.fromkeys((*MEASURED, *CONSTRAINTS, "kl", "num_decisions")))
+        self.names = list_scores(self.config)
         # Batches in order, each a stage and positions in the list of the stage's scenarios. Stage None finds the
         # direction, stage 0 measures without a step, stage i tries length i.
         stages = {
@@ -265,11 +273,9 @@ class CalibrationLearner(Learner):
         # A leave-one-out reward is centered on all rollouts: on the others it is larger by N / (N - 1). Then the score
         # function of a rollout times its credit is the gradient to first order, though the mean depends on the rollout.
         credits = [leave_one_out(values) for values in shares]
-        for name in self.config.constraints:
-            constraint = CONSTRAINTS[name]
-            credits.append(constraint.credit(constraint.shares(batch, rollouts, agents).double()))
         decides = rollouts.decision_mask.any(-1)  # [B, N, A]
-        return torch.stack([torch.where(decides, values.nan_to_num(), 0.0) for values in credits])
+        earned = torch.stack([torch.where(decides, values.nan_to_num(), 0.0) for values in credits])
+        return torch.cat([earned, credit_constraints(self.config.constraints, batch, rollouts, agents)])
 
     def _try_length(
         self, stage: int, positions: list[int], batches: list[list[int]], fabric: Fabric
@@ -282,7 +288,7 @@ class CalibrationLearner(Learner):
         for batch_positions in batches:
             batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, stage, fabric)
             values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
-            rules = {name: rule for name, rule in CONSTRAINTS.items() if name not in MEASURED}
+            rules = {name: constraint_by_name(name) for name in self.names[:-2] if name not in MEASURED}
             values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in rules.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
             rows[[positions.index(position) for position in batch_positions]] = torch.stack(
@@ -339,64 +345,6 @@ class Recorder:
         else:
             self.kl = self.kl + distribution.kl(distribution.base).flatten(1).sum(1)
         return decision
-
-
-# ---- constraints -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """A sum over agents, of which the mean over rollouts is held, or the least."""
-
-    shares: Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
-    """Part of each agent in each rollout; they are summed over agents."""
-    is_minimum: bool = False
-    """True = the value is that of the rollout with the least sum."""
-
-    def value(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B"]:
-        """Value in each scenario."""
-        total = shares.sum(-1)
-        return total.amin(1) if self.is_minimum else total.mean(1)
-
-    def credit(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-        """Contribution of an agent's decisions in a rollout to the value.
-
-        Summed with score functions over rollouts and agents, credits are an estimate of the value's gradient, without
-        bias where no agent's part depends on other agents.
-        """
-        if not self.is_minimum:
-            return leave_one_out(shares / shares.shape[1])
-        # Without the rollout of the least sum the value is the second one, without any other it is what it was.
-        first, second = shares.sum(-1).topk(2, dim=1, largest=False).indices.unbind(1)  # [B]
-        row, added = torch.arange(len(shares), device=shares.device), torch.zeros_like(shares)
-        added[row, first] = shares[row, first] - shares[row, second]
-        return added
-
-
-def share_speed(
-    batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores, *, is_evaluated: bool = False
-) -> Float[Tensor, "B N A"]:
-    """Parts of the agents in the mean speed, m/s, over the steps that the log has.
-
-    Args:
-        batch: Scenarios with logged tracks.
-        rollouts: N rollouts of each scenario.
-        agents: Scores of the same rollouts; not read here.
-        is_evaluated: True = only evaluated agents count.
-    """
-    speed, counts = mean_speeds(batch, rollouts)
-    if is_evaluated:
-        counts = counts & batch.evaluated_mask
-    return torch.where(counts[:, None], speed, 0.0) / counts.sum(-1).clamp(min=1)[:, None, None]
-
-
-CONSTRAINTS = {
-    "speed": Constraint(share_speed),
-    "evaluated_speed": Constraint(partial(share_speed, is_evaluated=True)),
-    "min_ade": Constraint(lambda batch, rollouts, agents: agents.displacement_error.double(), is_minimum=True),
-    "kinematic": Constraint(lambda batch, rollouts, agents: agents.sub_scores["kinematic"].double()),
-}
-"""Constrained means by name: m/s of all agents and of the evaluated ones, minADE in m, and the kinematic sub-score."""
 
 
 # ---- the step --------------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ FEATURES = (
 )
 """Features of this package that calibration weighs, see `policies.calibrated.features`."""
 CONSTRAINED_MEANS = ("speed", "evaluated_speed", "min_ade", "kinematic")
-"""Means that calibration may hold, see `calibrate.CONSTRAINTS`."""
+"""Means that calibration holds, see `training.constraints`."""
 
 
 def check_metric(name: str) -> None:
@@ -79,6 +79,11 @@ def _check_up_to_1(config: object, group: str = "", **words: str) -> None:
     for name, word in words.items():
         if not 0 <= getattr(config, name) <= 1:
             raise ConfigError(f"{group}{name} is {word} in [0, 1], got {getattr(config, name)}.")
+
+
+def _check_decay(ema_decay: float | None) -> None:
+    if ema_decay is not None and not 0 < ema_decay < 1:
+        raise ConfigError(f"ema_decay is a fraction between 0 and 1, or None, got {ema_decay}.")
 
 
 def _check_betas(betas: tuple[float, float]) -> None:
@@ -305,6 +310,11 @@ class FinetuneConfig:
     """Credit assignment: a reward weighs all decisions of its rollout alike, or each agent's by the agent's part."""
     credit_mixing: float = 0.1
     """With credit by agent: weight of what the other agents earned, in [0, 1]."""
+    credit_clip: float | None = None
+    """Rewards of agents are clipped to so many standard deviations of the update's. None = the paper's estimator."""
+    num_scored: int | None = None
+    """Most rollouts of each scenario that are scored with gradient, drawn by how much reward they carry; scoring a
+    rollout takes three times as long as simulating it. Not with hindsight. None = all, as in the paper."""
     learning_rate: float = 3e-6
     """Of Adam, after the warm-up."""
     warmup_updates: int = 100
@@ -315,15 +325,18 @@ class FinetuneConfig:
     """Decoupled, as in AdamW."""
     gradient_clip: float = 1.0
     """Largest norm of the gradient."""
+    ema_decay: float | None = None
+    """Validate and save an exponential moving average of the weights, with this fraction of it kept at each update: a
+    single update is mostly noise. None = the weights themselves, as in the paper."""
     entropy_bonus: float = 0.0
     """Weight of the policy's entropy in the objective."""
     imitation_weight: float = 0.0
     """Weight of the pre-training loss on the same scenarios in the objective: it holds speeds and kinematics near the
     log while realism rises. A loss with noise of its own (TrafficBots) draws it for each piece in memory, so that this
     part of an update depends on `micro_batch_size`. 0 = the paper's objective."""
-    hold_speed: bool = False
-    """Take out of the rewards what an agent's mean speed explains, so that driving slowly (or fast) earns nothing by
-    itself. Not with goals, which ask for a speed. False = the paper's objective."""
+    constraints: tuple[str, ...] = ()
+    """Means that stay as the first model has them: moving_speed, evaluated_moving_speed, stops, min_ade, kinematic. A
+    change has a price that grows while it lasts. Not with goals, which ask for a speed. () = the paper's objective."""
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
     trained: TrainedModules = "decoder"
@@ -356,7 +369,9 @@ class FinetuneConfig:
         check_positive(self, ("epochs", "learning_rate", "gradient_clip", "max_kl", *sizes))
         check_not_negative(self, ("warmup_updates", "weight_decay", "imitation_weight"))
         check_finiteness(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus", "imitation_weight"))
+        check_positive(self, given(self, ("credit_clip", "num_scored")))
         _check_betas(self.betas)
+        _check_decay(self.ema_decay)
         _check_up_to_1(self, credit_mixing="a weight")
         check_metric(self.metric)
         # Stored in one spelling, so that a run with the same reward written otherwise resumes.
@@ -369,10 +384,10 @@ class FinetuneConfig:
             )
         if depends_on_goals and not self.goals.probability:
             raise ConfigError(f"reward {self.reward!r} needs goals: set finetune.goals.probability above 0, such as 1.")
-        if self.hold_speed and depends_on_goals:
+        if self.constraints and depends_on_goals:
             raise ConfigError(
-                f"finetune.hold_speed would take the speed out of reward {self.reward!r} that goals ask for: set "
-                "finetune.hold_speed to false."
+                f"finetune.constraints would hold back the speed that goals of reward {self.reward!r} ask for: leave "
+                "them out."
             )
         if self.goals.hindsight and not depends_on_goals:
             raise ConfigError(
@@ -453,8 +468,7 @@ class ImitationConfig:
         _check_up_to_1(self, final_lr_ratio="a fraction", mirror_probability="a probability")
         if not 0 < self.still_weight <= 1:
             raise ConfigError(f"still_weight is a weight above 0 and at most 1, got {self.still_weight}.")
-        if self.ema_decay is not None and not 0 < self.ema_decay < 1:
-            raise ConfigError(f"ema_decay is a fraction between 0 and 1, or None, got {self.ema_decay}.")
+        _check_decay(self.ema_decay)
         if not 0 <= self.label_smoothing < 1:
             raise ConfigError(f"label_smoothing is a probability in [0, 1), got {self.label_smoothing}.")
         if self.label_smoothing_kind == "spatial" and not self.label_smoothing:
@@ -593,9 +607,6 @@ class CalibrateConfig:
             raise ConfigError(f"held_back is a fraction between 0 and 1, got {self.held_back}.")
         if not self.lengths or min(self.lengths) <= 0:
             raise ConfigError(f"lengths are numbers above 0, at least one, got {self.lengths}.")
-        for name in self.constraints:
-            if name not in CONSTRAINED_MEANS:
-                raise ConfigError(f"no constraint {name!r}: there are {', '.join(CONSTRAINED_MEANS)}.")
         check_metric(self.metric)
         object.__setattr__(self, "reward", complete_reward(self.reward)[0])
 

@@ -2,12 +2,12 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from rlftsim.goals.attainment import is_passed, is_reached, rate
@@ -15,13 +15,17 @@ from rlftsim.jobs.threads import one_thread
 from rlftsim.realism import RealismResult, score_rollouts
 from rlftsim.rewards import Rewards, Term, compute_rewards, parse_reward
 from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 from rlftsim.training.config import FinetuneConfig
+from rlftsim.training.constraints import credit_constraints, logged_speeds, measure_constraints, simulated_speeds
 from rlftsim.training.goals import choose_goals
 from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
+
+NUM_COMPARED = 8
+"""Rollouts of a scenario by the reference that constrained means are compared with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,21 +36,12 @@ class Experience:
     rollouts: Rollouts
     realism: RealismResult
     rewards: Rewards
+    constraint_credits: Float64[Tensor, "C B N A"]
+    """Contributions of the agents to the means that are held."""
     context: Any = None
     """Of the batch, made without gradient by the policy that rolled out; None = there is none to share."""
     rollout_ids: range | None = None
-    """Rollouts that this process scores with gradient, where several have the same scenarios; None = all."""
-
-    def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
-        """Yield this process's rollouts of every scenario with each agent's rewards.
-
-        Args:
-            size: Number of rollouts of a scenario at a time, so that few are in memory with gradients.
-        """
-        rollout_ids = self.rollout_ids or range(self.rollouts.num_rollouts)
-        for start in rollout_ids[::size]:
-            rows = slice(start, min(start + size, rollout_ids.stop))
-            yield self.rollouts.select(rows), self.rewards.by_agent[:, rows]
+    """Rollouts that this process simulated, where several have the same scenarios; None = all."""
 
 
 # ---- sampling and rewards ------------------------------------------------------------------------------------------
@@ -91,17 +86,20 @@ def _gather_rollouts(rollouts: Rollouts, num_rollouts: int, fabric: Fabric) -> R
     return replace(rollouts, **joined, goals=goals)
 
 
-def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
-    """Realism and rewards of rollouts, see `score_rollouts`.
+def compute_reward(
+    batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig
+) -> tuple[RealismResult, Rewards, Float64[Tensor, "C B N A"]]:
+    """Realism and rewards of rollouts, see `score_rollouts`, and shares of the agents in the constrained means.
 
     Args:
         batch: Scenarios with futures.
         rollouts: N rollouts of each scenario, in the frame of the batch.
-        config: Reward, metric and credit assignment.
+        config: Reward, metric, credit assignment and constraints.
     """
     realism, agents = score_rollouts(batch, rollouts, config.metric)
     terms, split = parse_reward(config.reward), agents if config.credit == "agent" else None
-    return realism, compute_rewards(terms, realism, rollouts, batch, split, credit_mixing=config.credit_mixing)
+    rewards = compute_rewards(terms, realism, rollouts, batch, split, credit_mixing=config.credit_mixing)
+    return realism, rewards, credit_constraints(config.constraints, batch, rollouts, agents)
 
 
 def most_realistic_ends(rollouts: Rollouts, realism: RealismResult) -> Float[Tensor, "B A 2"]:
@@ -116,38 +114,31 @@ def most_realistic_ends(rollouts: Rollouts, realism: RealismResult) -> Float[Ten
     return rollouts.position[torch.arange(len(index), device=index.device), index, :, -1]
 
 
-def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[Experience], float]:
-    """Rewards without the part that an agent's mean speed explains, so that being slow earns no reward.
-
-    The part is a linear regression over all agents of the update, each compared with the same agent in the scenario's
-    other rollouts, in the steps that the agent's log has. Slow cars collide less and stay on the road, so without this
-    the realism metric rewards driving slowly.
+def measure_changes(
+    learner: Any, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
+) -> list[float]:
+    """Change of each constrained mean from the reference, which rolls out the same scenarios with the same noise.
 
     Args:
-        experiences: Rollouts of this process with rewards, an entry per micro batch.
-        fabric: Processes of the run, over which sums are added.
-
-    Returns:
-        The experiences with other rewards by agent, and the slope that was removed, reward per m/s.
+        learner: Policy, reference, and number of the update.
+        experiences: Rollouts of this process by the policy, an entry per micro batch.
+        config: Constraints, and the seed of the rollouts.
+        fabric: Precision of the pass, and the processes that sums are added over.
     """
-    sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
-    deviations = []
+    if not config.constraints:
+        return []
+    count, seed = min(NUM_COMPARED, config.num_rollouts), derive_seed(config.seed, "rollouts", learner.update)
+    sums = torch.zeros(2, len(config.constraints), device=fabric.device, dtype=torch.float64)
     for experience in experiences:
-        mean_speed, _ = mean_speeds(experience.batch, experience.rollouts)
-        deviation = torch.nan_to_num(mean_speed - mean_speed.mean(1, keepdim=True), 0.0, 0.0, 0.0)
-        # A scenario of which no reward is known earns 0, and has no part in the regression.
-        has_reward = ~experience.rewards.is_missing.all(0)  # [B]
-        deviation = deviation * has_reward[:, None, None]
-        sums += torch.stack([(deviation * experience.rewards.by_agent).sum(), deviation.square().sum()])
-        deviations.append(deviation)
-    # One slope for all processes, or their gradients would not add up to that of one process.
-    explained, total = all_reduce_sum(sums, fabric).tolist()
-    slope = explained / total if total > 0 else 0.0
-    adjusted = [
-        replace(e, rewards=replace(e.rewards, by_agent=(e.rewards.by_agent - slope * deviation).float()))
-        for e, deviation in zip(experiences, deviations, strict=True)
-    ]
-    return adjusted, slope
+        batch, rollouts = experience.batch, experience.rollouts.select(slice(count))
+        with fabric.autocast(), torch.no_grad(), one_thread():
+            context = encode_like(learner.reference, batch, experience.context)
+            before = simulate(learner.reference, batch, num_rollouts=count, seed=seed, context=context, may_be_nan=True)
+        values, earlier = (measure_constraints(config.constraints, batch, r, config.metric) for r in (rollouts, before))
+        change = values - earlier  # [C, B]
+        sums += torch.stack([torch.where(change.isfinite(), change, 0.0).sum(1), change.isfinite().sum(1)])
+    total, num_scenarios = all_reduce_sum(sums, fabric)
+    return (total / num_scenarios.clamp(min=1)).tolist()
 
 
 def count_decisions(experiences: Sequence[Experience], fabric: Fabric) -> tuple[int, float]:
@@ -259,37 +250,7 @@ def compute_speed_gap(batch: ScenarioBatch, rollouts: Rollouts) -> Float[Tensor,
         NaN for a scenario with no logged future.
     """
     simulated, logged_valid = simulated_speeds(batch, rollouts)
-    logged = batch.position[:, :, CURRENT_STEP:].diff(dim=-2).norm(dim=-1) / STEP_S  # [B, A, T]
-    return ((simulated.mean(1) - logged) * logged_valid).sum((1, 2)) / logged_valid.sum((1, 2))
-
-
-def simulated_speeds(
-    batch: ScenarioBatch, rollouts: Rollouts
-) -> tuple[Float[Tensor, "B N A T"], Float[Tensor, "B A T"]]:
-    """Speeds of each step of the future, m/s, and 1 for the agents and steps that are valid in the log, else 0.
-
-    Args:
-        batch: scenarios with logged tracks.
-        rollouts: N rollouts of each scenario, in the frame of the batch.
-    """
-    future, valid = slice(CURRENT_STEP + 1, None), batch.valid
-    # A speed is the way of one step, so both of its ends have to be valid: [B, A, T].
-    logged_valid = (valid[:, :, future] & valid[:, :, CURRENT_STEP:-1] & batch.agent_mask[..., None]).double()
-    # The first simulated step starts at the current one, which is logged: [B, N, A, 1, 2].
-    start = batch.position[:, None, :, CURRENT_STEP, None].expand(-1, rollouts.num_rollouts, -1, -1, -1)
-    return torch.cat([start, rollouts.position], dim=-2).diff(dim=-2).norm(dim=-1) / STEP_S, logged_valid
-
-
-def mean_speeds(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[Float[Tensor, "B N A"], Bool[Tensor, "B A"]]:
-    """Mean speed of each agent over the steps that its log has, m/s, and True for agents with such steps; else 0.
-
-    Args:
-        batch: Scenarios with logged tracks.
-        rollouts: N rollouts of each scenario, in the frame of the batch.
-    """
-    speed, logged_valid = simulated_speeds(batch, rollouts)
-    mean = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]
-    return mean, logged_valid.any(-1)
+    return ((simulated.mean(1) - logged_speeds(batch)) * logged_valid).sum((1, 2)) / logged_valid.sum((1, 2))
 
 
 class UpdateClock:

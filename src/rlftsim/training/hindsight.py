@@ -18,21 +18,37 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.realism import RealismResult
 from rlftsim.rewards import Term, parse_reward
 from rlftsim.rewards.goal import goal_advantage, goal_terms
 from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.types import Rollouts
+from rlftsim.training.config import FinetuneConfig
 from rlftsim.training.experience import Experience, most_realistic_ends
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 from rlftsim.training.policy_gradient import GradientSums, LossTerms, agent_log_prob, policy_gradient_loss
+from rlftsim.training.scored_rollouts import ScoredRollouts
 
 LARGEST_RATIO = 10.0
 """Importance ratios are clipped to it."""
 
 
-def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Experience]:
+def check_hindsight(config: FinetuneConfig) -> None:
+    """Check that hindsight, where it is on, has all rollouts to relabel.
+
+    Raises:
+        ConfigError: Only some of the rollouts are scored.
+    """
+    if config.goals.hindsight and config.num_scored is not None:
+        raise ConfigError(
+            f"hindsight needs all rollouts, and finetune.num_scored is {config.num_scored}: set finetune.num_scored to "
+            "none."
+        )
+
+
+def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[ScoredRollouts]:
     """The rollouts as if sampled under goals that the most realistic rollout has met, and the resulting rewards.
 
     Only the reward's goal terms count: realism does not depend on goals and was rewarded before. Each agent earns a
@@ -50,8 +66,9 @@ def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Te
         for term in goal_terms(terms):
             options: dict[str, Any] = dict(term.options)
             earned = earned + term.weight * goal_advantage(rollouts, batch, **options)
-        rewards = replace(experience.rewards, by_agent=earned)
-        relabelled.append(replace(experience, rollouts=rollouts, rewards=rewards))
+        rollout_ids = experience.rollout_ids or range(rollouts.num_rollouts)
+        weight = earned.new_ones(earned.shape[:2])
+        relabelled.append(ScoredRollouts(batch, experience.context, rollouts, earned, weight, rollout_ids))
     return relabelled
 
 
@@ -105,15 +122,15 @@ def accumulate_hindsight(
         parameter.grad = None
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # ratios, agents
     relabelled = relabel_with_hindsight(experiences, parse_reward(config.reward))
-    for experience, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
-        for (rollouts, earned), old in zip(experience.slices(config.rollouts_per_pass), old_log_probs):
+    for entry, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
+        for (rows, rollouts), old in zip(entry.slices(config.rollouts_per_pass), old_log_probs):
             mask, decides = rollouts.decision_mask, rollouts.decision_mask.any(-1)  # [B, n, A, L], [B, n, A]
             with fabric.autocast():
-                dist = policy.score(encode_like(policy, experience.batch, experience.context), rollouts)
+                dist = policy.score(encode_like(policy, entry.batch, entry.context), rollouts)
             log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
             ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
             by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)
-            fabric.backward(policy_gradient_loss(earned * ratio, by_agent, terms.num_scenarios))
+            fabric.backward(policy_gradient_loss(entry.reward[:, rows] * ratio, by_agent, terms.num_scenarios))
             # Agents that decide nothing have a ratio of exp(0) = 1, which would pull the mean to 1.
             sums += torch.stack([ratio[decides].sum(), decides.sum()])
     total, count = all_reduce_sum(sums, fabric).tolist()

@@ -5,7 +5,6 @@ rollouts, or the policy's own rollouts. The loss is the cross-entropy of the tar
 brings (`ImitatedPolicy`); the sum over all scenarios of an update is divided by the number of predictions.
 """
 
-import copy
 import math
 import time
 from abc import abstractmethod
@@ -43,35 +42,13 @@ class Imitator(Learner):
 
     num_scenarios: int
     """Training scenarios, all of them."""
-    average: nn.Module | None = None
-    """Moving average of the weights, as a policy of its own."""
     frozen: Any = None
     """Policy that rolls out in place of the model, where the method has such a policy."""
 
     @property
     def modules(self) -> dict[str, nn.Module]:
         """Model, average and frozen policy, as far as present."""
-        further = {"average": self.average, "frozen": self.frozen}
-        return {**super().modules, **{name: module for name, module in further.items() if module is not None}}
-
-    @property
-    def result(self) -> Any:
-        """The average, if there is an average."""
-        return self.policy if self.average is None else self.average
-
-    def finish_update(self, *, is_good: bool) -> None:
-        """Take the optimizer's step, and move the average towards the weights."""
-        super().finish_update(is_good=is_good)
-        if self.average is None or self.config.ema_decay is None or not is_good:
-            return
-        # Early weights are far off: as long as few updates are made, the average is over about a tenth of them.
-        decay = min(self.config.ema_decay, (1 + self.update) / (10 + self.update))
-        with torch.no_grad():
-            for mean, weight in zip(self.average.state_dict().values(), self.policy.state_dict().values()):
-                if mean.is_floating_point():
-                    mean.lerp_(weight, 1 - decay)
-                else:
-                    mean.copy_(weight)
+        return super().modules | ({} if self.frozen is None else {"frozen": self.frozen})
 
 
 Config = TypeVar("Config", bound=ImitationConfig)
@@ -103,10 +80,7 @@ class ImitationMethod(Method[Config]):
         optimizer = torch.optim.AdamW(
             groups, lr=settings.learning_rate, betas=settings.betas, weight_decay=settings.weight_decay
         )
-        average = None if settings.ema_decay is None else copy.deepcopy(policy).requires_grad_(False)
-        return Imitator(
-            policy=policy, optimizer=optimizer, config=settings, num_scenarios=len(scenarios), average=average
-        )
+        return Imitator(policy=policy, optimizer=optimizer, config=settings, num_scenarios=len(scenarios))
 
     @abstractmethod
     def predict(

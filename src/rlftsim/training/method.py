@@ -8,12 +8,14 @@ Methods are registered by name, also by other packages. In the pyproject.toml of
 The method's section in a recipe and its flags bear this name: `rlftsim finetune --method nudge --nudge.step 1`.
 """
 
+import copy
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import nn
 from torch.optim import Optimizer
@@ -99,6 +101,12 @@ class Learner:
     """Condition under which updates are skipped, for the message of a run that diverged."""
     remedy: str = "lower learning_rate"
     """Settings to change after a divergence, for the same message."""
+    average: nn.Module | None = None
+    """Moving average of the weights, as a policy of its own; where the settings have an `ema_decay`."""
+
+    def __post_init__(self) -> None:
+        if self.average is None and getattr(self.config, "ema_decay", None) is not None:
+            self.average = copy.deepcopy(self.policy).requires_grad_(False)
 
     @property
     def parameters(self) -> list[nn.Parameter]:
@@ -107,13 +115,13 @@ class Learner:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Modules that a checkpoint holds, by file name."""
-        return {"policy": self.policy}
+        """Modules that a checkpoint holds, by file name: the policy, and the average where there is one."""
+        return {"policy": self.policy} | ({} if self.average is None else {"average": self.average})
 
     @property
     def result(self) -> Any:
-        """The policy that the run validates, and saves in the end."""
-        return self.policy
+        """The policy that the run validates, and saves in the end: the average where there is one."""
+        return self.policy if self.average is None else self.average
 
     def to_numbers(self) -> dict[str, float]:
         """Numbers that a checkpoint holds beside the weights."""
@@ -129,14 +137,27 @@ class Learner:
         """Take or skip the optimizer's step, and count the update either way.
 
         Args:
-            is_good: False = the gradient cannot be used; weights and moments stay.
+            is_good: False = the gradient cannot be used; weights, moments and average stay.
         """
         self.update += 1
-        if is_good:
-            self.optimizer.step()
-            self.skipped_in_a_row = 0
-        else:
+        if not is_good:
             self.skipped_in_a_row += 1
+            return
+        self.optimizer.step()
+        self.skipped_in_a_row = 0
+        if self.average is not None:
+            self._move_average(self.average)
+
+    @torch.no_grad()
+    def _move_average(self, average: nn.Module) -> None:
+        """Move the average a little towards the weights."""
+        # Early weights are far off: as long as few updates are made, the average is over about a tenth of them.
+        decay = min(self.config.ema_decay, (1 + self.update) / (10 + self.update))
+        for mean, weight in zip(average.state_dict().values(), self.policy.state_dict().values()):
+            if mean.is_floating_point():
+                mean.lerp_(weight, 1 - decay)
+            else:
+                mean.copy_(weight)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from rlftsim.rollout.policy import compute_statistics, encode_like, score_with_reference
 from rlftsim.training.config import FinetuneConfig, Reduction
-from rlftsim.training.experience import Experience
 from rlftsim.training.imitation import accumulate_imitation
 from rlftsim.training.parallel import Fabric, all_reduce_sum
+from rlftsim.training.scored_rollouts import ScoredRollouts
 
 
 def agent_log_prob(
@@ -92,11 +92,11 @@ class GradientSums:
     """Metric `imitation_loss`, the pre-training loss: nats per prediction, mean over all processes. Empty where it has
     no weight."""
     agent_log_prob: list[list[Float[Tensor, "_ _ _"]]]
-    """Summed log-probability of each agent's decisions, by experience and slice; no gradient."""
+    """Summed log-probability of each agent's decisions, by micro batch and slice; no gradient."""
 
 
 def accumulate_gradients(
-    policy: Any, reference: Any, experiences: Sequence[Experience], terms: LossTerms, fabric: Fabric
+    policy: Any, reference: Any, scored: Sequence[ScoredRollouts], terms: LossTerms, fabric: Fabric
 ) -> GradientSums:
     """Add this process's gradient of the loss to the policy's parameters.
 
@@ -108,42 +108,44 @@ def accumulate_gradients(
         reference: scores the rollouts without gradient; under the same goals, unless the setting
             `kl.condition_reference` is False. A reference whose goal encoder was added for this run is still goal-free;
             an already conditioned reference anchors the policy to the reference's goal-following.
-        experiences: Rollouts of this process with rewards, an entry per micro batch.
+        scored: Rollouts of this process with rewards, an entry per micro batch.
         terms: Coefficients of the loss, and the global counts that sums are divided by.
         fabric: precision, and the processes that the statistics are summed over.
     """
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # KL, entropy
     gaps: list[Tensor] = []
-    by_experience: list[list[Tensor]] = []
+    by_entry: list[list[Tensor]] = []
     config, num_decisions = terms.config, max(terms.num_decisions, 1.0)
     imitation: dict[str, float] = {}
     if config.imitation_weight:
-        batches = [experience.batch for experience in experiences]
+        batches = [entry.batch for entry in scored]
         imitation["imitation_loss"] = accumulate_imitation(
             policy, batches, config.imitation_weight, fabric, update=terms.update, seed=config.seed
         )
-    for experience in experiences:
-        by_experience.append([])
+    for entry in scored:
+        by_entry.append([])
         with fabric.autocast(), torch.no_grad():
-            ref_context = encode_like(reference, experience.batch, experience.context)
-        for rollouts, reward in experience.slices(config.rollouts_per_pass):
+            ref_context = encode_like(reference, entry.batch, entry.context)
+        for rows, rollouts in entry.slices(config.rollouts_per_pass):
             mask = rollouts.decision_mask  # [B, n, A, L]
             ref_rollouts = rollouts if config.kl.condition_reference else replace(rollouts, goals=None)
             with fabric.autocast():
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
-                context = encode_like(policy, experience.batch, experience.context)
+                context = encode_like(policy, entry.batch, entry.context)
                 dist, ref_dist = score_with_reference(policy, context, rollouts, reference, ref_context, ref_rollouts)
             statistics = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
-            kl, entropy = masked_sum(statistics.kl, mask), masked_sum(statistics.entropy, mask)
+            weight = entry.weight[:, rows, None]  # [B, n, 1]
+            kl = masked_sum(statistics.kl * weight[..., None], mask)
+            entropy = masked_sum(statistics.entropy * weight[..., None], mask)
             by_agent = agent_log_prob(statistics.log_prob, mask, config.log_prob_reduction)  # [B, n, A]
-            loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
+            loss = policy_gradient_loss(entry.reward[:, rows] * weight, by_agent, terms.num_scenarios)
             loss = loss + (terms.beta * kl - config.entropy_bonus * entropy) / num_decisions
             # Every slice adds its part; nothing is divided by the number of slices.
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])
             log_prob = statistics.log_prob.detach()
             gaps.append(torch.where(mask, log_prob - rollouts.log_prob, 0.0).abs().max())
-            by_experience[-1].append(agent_log_prob(log_prob, mask, "sum"))
+            by_entry[-1].append(agent_log_prob(log_prob, mask, "sum"))
     kl_sum, entropy_sum = all_reduce_sum(sums, fabric).tolist()
     gap = float(torch.stack(gaps).max())
-    return GradientSums(kl_sum / num_decisions, entropy_sum / num_decisions, gap, imitation, by_experience)
+    return GradientSums(kl_sum / num_decisions, entropy_sum / num_decisions, gap, imitation, by_entry)

@@ -16,13 +16,13 @@ from rlftsim.rewards import parse_reward
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.config import FinetuneConfig, KlConfig
+from rlftsim.training.constraints import Prices, constraint_by_name
 from rlftsim.training.experience import (
     Experience,
     UpdateClock,
     compute_reward,
     count_decisions,
     describe,
-    hold_speed,
     missing_rate_name,
     sample_rollouts,
 )
@@ -34,37 +34,41 @@ from rlftsim.training.freezing import (
     set_learning_rate,
 )
 from rlftsim.training.goals import StoredGoals, check_goals, open_augmented
-from rlftsim.training.hindsight import accumulate_hindsight
+from rlftsim.training.hindsight import accumulate_hindsight, check_hindsight
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.monitoring import Alarms
 from rlftsim.training.parallel import Fabric, all_reduce_gradients, local_rollouts, num_sharing_memory
 from rlftsim.training.policy_gradient import LossTerms, accumulate_gradients
+from rlftsim.training.scored_rollouts import choose_scored
 
 
 @dataclass(eq=False, kw_only=True)
 class RewardLearner(Learner):
-    """A policy in fine-tuning with the frozen reference, the KL penalty's strength and the alarms."""
+    """A policy in fine-tuning with the frozen reference, the KL penalty's strength, prices and alarms."""
 
     reference: Any
     beta: float
     augmented_goals: StoredGoals | None = None
     """Goals beside the logged endpoints."""
+    prices: Prices
+    """Multipliers of the constraints."""
     alarms: Alarms = field(default_factory=Alarms)
     warned_terms: set[str] = field(default_factory=set)
     """Terms of the reward that a message has called not finite."""
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Modules that a checkpoint holds: the policy and the reference."""
-        return {"policy": self.policy, "reference": self.reference}
+        """Modules that a checkpoint holds: also the reference."""
+        return super().modules | {"reference": self.reference}
 
     def to_numbers(self) -> dict[str, float]:
-        """Beta and the alarms' running means."""
-        return {"beta": self.beta, **self.alarms.to_numbers()}
+        """Beta, prices and the alarms' running means."""
+        return {"beta": self.beta, **self.prices.to_numbers(), **self.alarms.to_numbers()}
 
     def load_numbers(self, numbers: Mapping[str, float]) -> None:
-        """Take back beta and the alarms' running means."""
+        """Take back beta, prices and the alarms' running means."""
         self.beta = numbers["beta"]
+        self.prices.load_numbers(numbers)
         self.alarms.load_numbers(numbers)
 
 
@@ -84,6 +88,9 @@ class RewardMethod(Method[FinetuneConfig]):
         check_trainable(policy, scenarios, "rewards", is_imitated=settings.imitation_weight > 0, is_rewarded=True)
         select_trained_modules(policy, settings.trained)
         check_goals(policy, settings.goals.probability)
+        for name in settings.constraints:
+            constraint_by_name(name)
+        check_hindsight(settings)
         augmented = open_augmented(settings.goals, scenarios)
         if settings.entropy_bonus:
             check_entropy(policy, scenarios[0], settings.trained)
@@ -106,7 +113,8 @@ class RewardMethod(Method[FinetuneConfig]):
         cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
         if not math.isfinite(values["gradient_norm"]):
             cause = "its gradient is not finite"
-        note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}"
+        changes = "".join(f", {name} {values[f'change_{name}']:+.3f}" for name in config.constraints)
+        note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}{changes}"
         stop_because = f"{raised[0]}" if config.alarms.stop and raised else ""
         return UpdateReport({**values, **levels}, note, cause, alarms, stop_because)
 
@@ -135,6 +143,7 @@ def prepare(
     beta = config.kl.initial_beta
     return RewardLearner(
         policy=policy, reference=reference, optimizer=optimizer, config=config, beta=beta, augmented_goals=augmented,
+        prices=Prices(config.constraints),
         inputs={"augmented_goals": augmented.fingerprint} if augmented else {},
         may_grow=("epochs",),  # the learning rate is constant: a longer run passes through the same weights
         skip_rule=f"KL above max_kl={config.max_kl} or not finite",
@@ -164,17 +173,17 @@ def update_policy(
         context, rollouts = sample_rollouts(learner, micro_batch, config, rollout_ids, fabric)
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
-        realism, rewards = compute_reward(micro_batch, rollouts, config)
-        experiences.append(Experience(micro_batch, rollouts, realism, rewards, context, rollout_ids))
+        rewarded = compute_reward(micro_batch, rollouts, config)
+        experiences.append(Experience(micro_batch, rollouts, *rewarded, context, rollout_ids))
         clock.lap("reward")
-    speed = {}
-    if config.hold_speed:  # over the whole batch, so not by part
-        experiences, speed["speed_slope"] = hold_speed(experiences, fabric)
-    # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty, and of the
-    # pre-training loss where it has a weight.
+    # 3. Take the price of constrained means from the rewards, and score those rollouts that carry most, under policy
+    # and reference: gradient of the policy-gradient loss with its KL penalty, and of the pre-training loss where it has
+    # a weight. Over the whole batch, so not by part.
+    scored, constrained = choose_scored(learner, experiences, config, fabric)
+    clock.lap("constraints")
     terms = LossTerms(*count_decisions(experiences, fabric), learner.beta, learner.update, config)
     learner.optimizer.zero_grad(set_to_none=True)
-    sums = accumulate_gradients(learner.policy, learner.reference, experiences, terms, fabric)
+    sums = accumulate_gradients(learner.policy, learner.reference, scored, terms, fabric)
     # 4. Score them again under goals that one of them has met: gradient of the goal reward in hindsight.
     hindsight = accumulate_hindsight(learner.policy, experiences, sums, terms, fabric)
     all_reduce_gradients(learner.parameters, fabric)
@@ -185,8 +194,8 @@ def update_policy(
     set_learning_rate(learner.optimizer, config.learning_rate * warmup)
     learner.finish_update(is_good=math.isfinite(norm) and sums.kl <= config.max_kl)
     values = {
-        **describe(experiences, fabric), **speed, "kl": sums.kl, "entropy": sums.entropy, **hindsight,
-        **sums.imitation, "score_gap": sums.score_gap, "beta": learner.beta, "gradient_norm": norm,
+        **describe(experiences, fabric), **constrained, "kl": sums.kl, "entropy": sums.entropy,
+        **hindsight, **sums.imitation, "score_gap": sums.score_gap, "beta": learner.beta, "gradient_norm": norm,
         "skipped": float(learner.skipped_in_a_row),
     }  # fmt: skip
     # 6. Adapt the strength of the KL penalty to the KL of this update.

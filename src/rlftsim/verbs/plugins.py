@@ -16,6 +16,7 @@ POINTS = {
     "rlftsim.rewards": "rlftsim.rewards:REWARDS",
     "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
     "rlftsim.features": "rlftsim.policies.calibrated.features:FEATURES",
+    "rlftsim.constraints": "rlftsim.training.constraints:CONSTRAINTS",
     "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
     "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
     "rlftsim.trackers": "rlftsim.training.trackers:TRACKERS",

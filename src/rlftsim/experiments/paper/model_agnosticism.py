@@ -89,7 +89,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             # The settings that each recipe chooses for itself.
             *(
                 f"{s.recipe.model_name}: {s.budget}; credit by {s.recipe.finetune.credit}, "
-                f"speed {'held' if s.recipe.finetune.hold_speed else 'not held'}."
+                f"speed {'held' if s.recipe.finetune.constraints else 'not held'}."
                 for s in suites(suite)
             ),
             f"Gains are tested at level {ALPHA:g}, scenarios paired.",
