@@ -58,9 +58,7 @@ def expected_value_and_gradient(constraint, eta, num_agents, num_rollouts=3):
     return value, gradient
 
 
-@pytest.mark.parametrize(
-    ("name", "num_agents"), [("speed", 2), ("min_ade", 1)], ids=["mean", "minimum"]
-)
+@pytest.mark.parametrize(("name", "num_agents"), [("speed", 2), ("min_ade", 1)], ids=["mean", "minimum"])
 def test_credit_times_score_function_is_the_gradient_of_the_expected_value(name, num_agents):
     constraint = constraint_by_name(name)
     (high, _), (low, _) = (expected_value_and_gradient(constraint, eta, num_agents) for eta in (0.2 + 1e-4, 0.2 - 1e-4))

@@ -262,8 +262,8 @@ def test_settings_of_the_estimator_have_bounds(changes):
 def test_hindsight_scores_all_rollouts(vocabulary, drawn_scenarios, tmp_path):
     goals = replace(CONFIG.goals, probability=1.0, hindsight=0.5)
     config = replace(CONFIG, constraints=(), reward="gcft", goals=goals, num_scored=2)
-    with pytest.raises(ConfigError, match="hindsight needs all rollouts, and finetune.num_scored is 2"):
-        policy = tiny.tiny_policy(vocabulary).with_goal_conditioning("concat")
+    policy = tiny.tiny_policy(vocabulary).with_goal_conditioning("concat")
+    with pytest.raises(ConfigError, match=r"hindsight needs all rollouts, and finetune\.num_scored is 2"):
         train_policy(policy, drawn_scenarios, tmp_path, config)
 
 
