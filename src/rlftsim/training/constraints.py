@@ -154,7 +154,7 @@ def credit_constraints(
 def measure_constraints(
     names: Sequence[str], batch: ScenarioBatch, rollouts: Rollouts, metric: str
 ) -> Float64[Tensor, "C B"]:
-    """Values of the constrained means in each scenario; NaN where a scenario has none.
+    """Values of the constrained means in each scenario; 0 where no agent counts.
 
     Args:
         names: Names of C constraints.
