@@ -116,7 +116,8 @@ SWITCHES = ["--finetune.kl.no-condition-reference", "--no-goal-logit-bias", "--g
 )
 def test_a_switch_beside_the_recipe_changes_no_other_setting(words):
     settings = settings_of(["finetune", *words])
-    recipe = recipe_by_name("smart-demo").finetune
+    recipe = recipe_by_name("smart-demo")
+    recipe = (recipe.with_goals() if "--goal=concat" in words else recipe).finetune
     assert settings.model == recipe_by_name("smart-demo").model
     assert settings.finetune.kl.condition_reference is False
     assert (settings.finetune.epochs, settings.finetune.num_rollouts) == (recipe.epochs, recipe.num_rollouts)
