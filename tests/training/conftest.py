@@ -1,7 +1,14 @@
 import pytest
 import torch
 
+import tiny
+from rlftsim.training.parallel import start_fabric
 from tiny_fixtures import drawn_scenarios, measured, simulated, vocabulary  # noqa: F401
+
+
+@pytest.fixture(scope="module")
+def fabric():
+    return start_fabric(tiny.CPU)
 
 
 @pytest.fixture(autouse=True)

@@ -24,17 +24,11 @@ from rlftsim.training.constraints import (
     register_constraint,
 )
 from rlftsim.training.experience import compute_reward
-from rlftsim.training.parallel import start_fabric
 from rlftsim.training.reward import prepare, update_policy
 from rlftsim.training.run import train_policy
 from rlftsim.training.scored_rollouts import draw_rollouts
 
 CONFIG = replace(tiny.FINETUNE, num_rollouts=4, credit="agent", constraints=("speed", "kinematic"))
-
-
-@pytest.fixture(scope="module")
-def fabric():
-    return start_fabric(tiny.CPU)
 
 
 @pytest.fixture

@@ -34,11 +34,6 @@ from rlftsim.training.run_folder import read_metrics
 CONFIG = replace(tiny.FINETUNE, num_rollouts=4, gradient_clip=1e9)
 
 
-@pytest.fixture(scope="module")
-def fabric():
-    return start_fabric(tiny.CPU)
-
-
 @pytest.fixture
 def batch(drawn_scenarios):
     return collate(drawn_scenarios[:2])

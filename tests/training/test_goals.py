@@ -30,18 +30,12 @@ from rlftsim.training.freezing import freeze_untrained
 from rlftsim.training.goal_relabeling import relabel_with_endpoints
 from rlftsim.training.goals import choose_goals
 from rlftsim.training.hindsight import importance_ratio, met_goals, relabel_with_hindsight
-from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import agent_log_prob
 from rlftsim.training.reward import prepare, update_policy
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 
 CONFIG = replace(tiny.FINETUNE, num_rollouts=3, reward="gcft", goals=GoalConfig(probability=1.0))
-
-
-@pytest.fixture(scope="module")
-def fabric():
-    return start_fabric(tiny.CPU)
 
 
 @pytest.fixture

@@ -15,13 +15,18 @@ from rlftsim.geometry import boxes_overlap, wrapped
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.polylines import densify
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, ObjectType, Scenario, cached_on_scenario
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    MOVING_M_S,
+    STEP_S,
+    STOP_M_S,
+    STOP_STEPS,
+    TOTAL_STEPS,
+    ObjectType,
+    Scenario,
+    cached_on_scenario,
+)
 
-MOVING_M_S = 1.0
-"""An agent moves if its mean logged speed is at least this."""
-STOP_M_S = 0.5
-STOP_STEPS = 10
-"""A stop: slower than `STOP_M_S` for one second on end."""
 LANE_SPACING_M = 1.0
 LANE_REACH_M = 3.0
 """Farther from every lane center a vehicle is not in a lane."""

@@ -32,6 +32,11 @@ HISTORY_STEPS = 11
 CURRENT_STEP = 10
 FUTURE_STEPS = 80
 TOTAL_STEPS = 91
+MOVING_M_S = 1.0
+"""An agent moves if its mean logged speed is at least this."""
+STOP_M_S = 0.5
+STOP_STEPS = 10
+"""A stop: slower than `STOP_M_S` for one second on end."""
 
 
 def count_steps(seconds: float) -> int:

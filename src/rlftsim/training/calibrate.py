@@ -33,7 +33,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios, list_scenario_ids
 from rlftsim.training.config import CONSTRAINED_MEANS, CalibrateConfig
-from rlftsim.training.constraints import constraint_by_name, credit_constraints
+from rlftsim.training.constraints import check_constraints, constraint_by_name, credit_constraints
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
@@ -63,8 +63,7 @@ class CalibrateMethod(Method[CalibrateConfig]):
     ) -> "CalibrationLearner":
         """Learner of the features' weights; the features have to be those of the settings."""
         check_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), is_rewarded=True)
-        for name in settings.constraints:
-            constraint_by_name(name)
+        check_constraints(settings.constraints)
         if tuple(policy.features) != settings.features:
             raise ConfigError(
                 f"the policy has the features {', '.join(policy.features)}, the settings others: make it with "

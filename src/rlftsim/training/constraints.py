@@ -27,13 +27,11 @@ from rlftsim.realism import AgentScores, score_rollouts
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import CURRENT_STEP, STEP_S
+from rlftsim.scenario.types import CURRENT_STEP, MOVING_M_S, STEP_S, STOP_M_S, STOP_STEPS
 
 Direction = Literal["both", "rise", "fall"]
 Shares = Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
 
-MOVING_M_S, STOP_M_S, STOP_STEPS = 1.0, 0.5, 10
-"""A stop: slower than 0.5 m/s for a second on end, of an agent that moves at 1 m/s or more on average in the log."""
 RATE = 0.02
 """Growth of a price per update while a mean is off, as a fraction of the part that answers at once."""
 SHARE = 0.003
@@ -130,6 +128,16 @@ def constraint_by_name(name: str) -> Constraint:
             f"constraint {name!r} is of type {type(constraint).__name__}: decorate it with register_constraint."
         )
     return constraint
+
+
+def check_constraints(names: Sequence[str]) -> None:
+    """Check before a run that each name is that of a constraint.
+
+    Raises:
+        ConfigError: As of `constraint_by_name`.
+    """
+    for name in names:
+        constraint_by_name(name)
 
 
 def credit_constraints(

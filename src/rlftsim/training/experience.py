@@ -125,8 +125,6 @@ def measure_changes(
         config: Constraints, and the seed of the rollouts.
         fabric: Precision of the pass, and the processes that sums are added over.
     """
-    if not config.constraints:
-        return []
     count, seed = min(NUM_COMPARED, config.num_rollouts), derive_seed(config.seed, "rollouts", learner.update)
     sums = torch.zeros(2, len(config.constraints), device=fabric.device, dtype=torch.float64)
     for experience in experiences:

@@ -16,7 +16,7 @@ from rlftsim.rewards import parse_reward
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.config import FinetuneConfig, KlConfig
-from rlftsim.training.constraints import Prices, constraint_by_name
+from rlftsim.training.constraints import Prices, check_constraints
 from rlftsim.training.experience import (
     Experience,
     UpdateClock,
@@ -88,8 +88,7 @@ class RewardMethod(Method[FinetuneConfig]):
         check_trainable(policy, scenarios, "rewards", is_imitated=settings.imitation_weight > 0, is_rewarded=True)
         select_trained_modules(policy, settings.trained)
         check_goals(policy, settings.goals.probability)
-        for name in settings.constraints:
-            constraint_by_name(name)
+        check_constraints(settings.constraints)
         check_hindsight(settings)
         augmented = open_augmented(settings.goals, scenarios)
         if settings.entropy_bonus:

@@ -74,9 +74,12 @@ def choose_scored(
         for experience in experiences
     ]
     rewards = _clip(earned, config.credit_clip, fabric)
-    changes = measure_changes(learner, experiences, config, fabric)
-    metrics = prices.watch(*_measure(experiences, rewards, fabric), changes)
-    price = torch.tensor([prices.price(name) for name in prices.names], dtype=torch.float64, device=fabric.device)
+    metrics: dict[str, float] = {}
+    if prices.names:
+        changes = measure_changes(learner, experiences, config, fabric)
+        metrics = prices.watch(*_measure(experiences, rewards, fabric), changes)
+    values = [metrics[f"price_{name}"] for name in prices.names]
+    price = torch.tensor(values, dtype=torch.float64, device=fabric.device)
     scored = []
     for experience, reward in zip(experiences, rewards):
         batch, rollouts, context = experience.batch, experience.rollouts, experience.context
