@@ -8,12 +8,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 
+from rlftsim.envs.compiled import compiled
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import wrapped
 from rlftsim.rollout.policy import Policy, TokenPolicy
@@ -187,24 +188,38 @@ class Bicycle(Controls):
             steering: Angle of the front wheel, rad, positive to the left.
             length: Length of the vehicles, m; the wheelbase is 0.6 of the length.
         """
-        x, y, heading = motion[..., 0], motion[..., 1], motion[..., 2]
-        speed = signed_speed(motion)
+        rows = np.empty((*np.shape(acceleration), 8))
+        rows[..., :5], rows[..., 5], rows[..., 6], rows[..., 7] = motion, acceleration, steering, length
+        return _drive_bicycles(rows.reshape(-1, 8), self.reverse).reshape(*rows.shape[:-1], 5)
+
+
+@compiled
+@no_type_check
+def _drive_bicycles(rows, reverse):
+    """Motion [n, 5] of bicycles with x, y, heading, vx, vy, acceleration, steering and length [n, 8]."""
+    motion = np.empty((len(rows), 5))
+    for i in range(len(rows)):
+        x, y, heading, vx, vy, acceleration, steering, length = rows[i]
+        speed = np.hypot(vx, vy)
+        if vx * math.cos(heading) + vy * math.sin(heading) < 0:
+            speed = -speed
         new_speed = speed + acceleration * STEP_S
-        if not self.reverse:
+        if not reverse:
             # a vehicle that backs up already brakes until it stands: nothing stops at once
-            new_speed = np.maximum(new_speed, np.minimum(speed + ACCELERATION_MPS2 * STEP_S, 0.0))
+            new_speed = max(new_speed, min(speed + ACCELERATION_MPS2 * STEP_S, 0.0))
         mean_speed = (speed + new_speed) / 2
         # the center lies between the axles, so it moves at an angle to the heading
-        slip = np.arctan(np.tan(steering) / 2)
-        turn = mean_speed * np.cos(slip) * np.tan(steering) / (WHEELBASE_PER_LENGTH * length) * STEP_S
-        chord = mean_speed * STEP_S * np.sinc(turn / 2 / math.pi)  # of the arc
+        slip = math.atan(math.tan(steering) / 2)
+        turn = mean_speed * math.cos(slip) * math.tan(steering) / (WHEELBASE_PER_LENGTH * length) * STEP_S
+        chord = mean_speed * STEP_S * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)  # of the arc
         chord_direction = heading + slip + turn / 2
-        new_heading = wrapped(heading + turn)
+        new_heading = (heading + turn + math.pi) % (2 * math.pi) - math.pi
         direction = new_heading + slip
-        return np.stack([
-            x + chord * np.cos(chord_direction), y + chord * np.sin(chord_direction), new_heading,
-            new_speed * np.cos(direction), new_speed * np.sin(direction),
-        ], -1)  # fmt: skip
+        motion[i, 0] = x + chord * math.cos(chord_direction)
+        motion[i, 1] = y + chord * math.sin(chord_direction)
+        motion[i, 2] = new_heading
+        motion[i, 3], motion[i, 4] = new_speed * math.cos(direction), new_speed * math.sin(direction)
+    return motion
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ class StepView:
         """Rows of the agents that are there, near and not yet touched."""
         scene, agent = self.index
         world, motion = self.episode.world, self.state.world.motion[scene]
-        counts = find_presence(world, self.state.world, 1)[1][scene, :, 0] & ~self.state.touched[self.row]
+        counts = find_presence(world, self.state.world, 1)[1][0, scene] & ~self.state.touched[self.row]
         counts[agent] = False
         return np.flatnonzero(counts & (np.abs(motion[:, :2] - motion[agent, :2]).max(1) < reach_m))
 

@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.actions import Actors, Controls, validate_actions
@@ -17,18 +16,16 @@ from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, classify_collision
 from rlftsim.envs.observations import FAR_M, Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
-from rlftsim.envs.road import MAX_PAIRS, nearest_edges, road_edges
-from rlftsim.envs.route import SPACING_M, find_route
+from rlftsim.envs.road import EdgeArrays, measure_road_edge, road_edges
+from rlftsim.envs.route import find_route
+from rlftsim.envs.step_measures import measure_steps
 from rlftsim.envs.world import Dice, World, WorldState, begin, find_presence, step_world, with_dice
-from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
+from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap
 from rlftsim.goals.types import PointById
-from rlftsim.realism.map_based import OUTSIDE_M, RoadEdges, compute_point_distance_to_road_edge, join_road_edges
+from rlftsim.realism.map_based import OUTSIDE_M, join_road_edges
 from rlftsim.scenario.types import FUTURE_STEPS
-from rlftsim.viewer.scene import SIMPLIFY_TOLERANCE_M
 
 AT_GOAL_M = 2.0
-SIMPLIFIED_M = 2 * SIMPLIFY_TOLERANCE_M
-"""The edges of the observations are nearer to the logged ones than this."""
 MAP_END_M = 30.0
 """The map has ended where no lane and no road edge is as near as this."""
 ScenarioGoals = Mapping[str, PointById]
@@ -44,7 +41,8 @@ class Episode:
     controls: Controls
     terms: tuple[WeightedTerm, ...]
     config: EnvConfig
-    edges: RoadEdges | None
+    edges: EdgeArrays | None
+    """None = no scene has any, or nobody asks who is on the road."""
     goals: ScenarioGoals | None
     """Of agents that follow the policy."""
 
@@ -71,6 +69,21 @@ class Episode:
         reach = (diagonal[scene] + diagonal[scene, agent][:, None]) / 2 + 1e-6
         reach[np.arange(self.num_agents), agent] = -1.0
         return reach
+
+    @cached_property
+    def half_diagonal(self) -> Float[np.ndarray, "M"]:
+        """Half of the diagonals of the planner-driven agents' boxes, m."""
+        return np.hypot(self.size[:, 0], self.size[:, 1]) / 2
+
+    @cached_property
+    def origin(self) -> Float[np.ndarray, "M 2"]:
+        """Origins of the map frames of the planner-driven agents, world frame, m."""
+        return np.stack([self.world.scenes[scene].scenario.origin for scene, _ in self.world.actors])
+
+    @cached_property
+    def has_edges(self) -> Bool[np.ndarray, "B"]:
+        """True = the map of the scene has road edges."""
+        return np.array([road_edges(scene.scenario) is not None for scene in self.world.scenes])
 
     @cached_property
     def last_light_step(self) -> Int64[np.ndarray, "M"]:
@@ -130,7 +143,8 @@ def build_episode(world: World, controls: Controls, config: EnvConfig, goals: Sc
         scene = world.scenes[row]
         choice = config.route if agent == scene.ego else "logged"
         routes.append(find_route(scene.scenario, int(agent), choice, scene.num_steps))
-    edges = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
+    joined = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
+    edges = None if joined is None else EdgeArrays.from_edges(joined)
     return Episode(world, build_atlas(world, tuple(routes)), controls, parse_terms(config.reward), config, edges, goals)
 
 
@@ -143,16 +157,17 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     """
     world = begin(episode.world, dice)
     motion = own_motion(episode, world)
+    in_reach, measures = _measure(episode, world, motion, motion)
     never = np.zeros(episode.num_agents, bool)
     off = off_road_m(episode, world, np.arange(episode.num_agents))
     return EpisodeState(
         world=world,
-        touched=_contacts(episode, world, motion),
+        touched=_contacts(episode, world, motion, in_reach),
         collisions=((),) * episode.num_agents,
         outside=off >= OUTSIDE_M,
         clear_m=OUTSIDE_M - off,
         at_goal=never,
-        progress=_progress(episode, motion),
+        progress=measures[:, 1],
         ended=never,
     )
 
@@ -234,7 +249,7 @@ def _with_ends(episode: Episode, state: EpisodeState) -> tuple[EpisodeState, Boo
     """The same state, with marks for the agents whose episode ends here, and True for those that an event stops."""
     is_over, stopped = state.world.step >= episode.config.max_steps, _stopped(episode, state)
     if state.world.step > FUTURE_STEPS:
-        is_over |= has_left_map(episode, state.world)
+        is_over |= has_left_map(episode, state.world, np.arange(episode.num_agents))
     return replace(state, ended=state.ended | stopped | is_over), stopped
 
 
@@ -248,7 +263,8 @@ def _step(
     touched = state.touched
     if world.has_left:  # others take the rows of those that have left
         touched = touched & ~world.has_left[-1][episode.world.actors[:, 0]]
-    contacts = _contacts(episode, world, moved) & ~touched
+    in_reach, measures = _measure(episode, world, previous, moved)
+    contacts = _contacts(episode, world, moved, in_reach & ~touched)
     collisions, (new_collisions, at_fault) = list(state.collisions), np.zeros((2, episode.num_agents))
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
         scene, _ = episode.world.actors[row]
@@ -260,22 +276,17 @@ def _step(
         new_collisions[row] += 1.0
         at_fault[row] += collision.at_fault
     # 2. road and route
-    step = moved - previous
-    half_diagonal = np.hypot(episode.size[:, 0], episode.size[:, 1]) / 2
-    clear = state.clear_m - np.hypot(step[:, 0], step[:, 1]) - np.abs(wrapped(step[:, 2])) * half_diagonal
+    swept_m, progress, forward, to_end_m = measures.T
+    clear = state.clear_m - swept_m
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
-        clear[unclear] = _free_way_m(episode, world, unclear)
+        clear[unclear] = OUTSIDE_M - off_road_m(episode, world, unclear)
     outside = state.outside.copy()
     outside[unclear] = clear[unclear] <= 0
-    progress = _progress(episode, moved)
-    gained = progress - state.progress
-    routeless = episode.atlas.route_length == 0
-    forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
-    near_end = np.abs(moved[:, 0] + 1j * moved[:, 1] - episode.atlas.route_end) <= AT_GOAL_M
-    at_goal = state.at_goal | (near_end & ~routeless)
+    routeless = episode.atlas.route_arrays.length == 0
+    at_goal = state.at_goal | ((to_end_m <= AT_GOAL_M) & ~routeless)
     terms = {
-        "progress": np.where(routeless, forward, gained) / 10.0,
+        "progress": np.where(routeless, forward, progress - state.progress) / 10.0,
         "collision": new_collisions,
         "at_fault": at_fault,
         "offroad": (outside & ~state.outside).astype(float),
@@ -309,16 +320,18 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
     return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
 
 
-def has_left_map(episode: Episode, world: WorldState) -> Bool[np.ndarray, "M"]:
+def has_left_map(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
     """True where a planner-driven agent is beyond the end of the map, where no score means anything.
 
     Args:
         episode: Episode with the constant world, map and settings.
         world: State of the episode's scenes, at any step.
+        rows: Rows of the planner-driven agents to look at.
     """
-    atlas, motion = episode.atlas, own_motion(episode, world)
-    columns = np.r_[atlas.columns["lanes"], atlas.columns["edges"]]
-    nearest = np.hypot(atlas.x[:, columns] - motion[:, :1], atlas.y[:, columns] - motion[:, 1:2]).min(1)
+    maps, (scene, agent) = episode.atlas.maps, episode.world.actors[rows].T
+    scene_map, columns = maps.of_scene[scene], slice(maps.lanes.shape[1] + maps.edges.shape[1])
+    x, y = world.motion[scene, agent, :2].T[..., None]
+    nearest = np.hypot(maps.x[scene_map, columns] - x, maps.y[scene_map, columns] - y).min(1)
     return (nearest > MAP_END_M) & (nearest < FAR_M / 2)  # without a map there is only padding
 
 
@@ -337,66 +350,46 @@ def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]
         rows: Rows of the planner-driven agents to measure.
     """
     scene, agent = episode.world.actors[rows].T
-    if episode.edges is None or not len(rows):
+    if episode.edges is None:
         return np.full(len(rows), -np.inf)
     motion = world.motion[scene, agent]
+    points = np.empty((len(rows), 4, 3), np.float32)
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])
-    origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
-    z = np.repeat(_ground(episode, world, rows)[:, None, None], 4, 1)
-    groups = torch.from_numpy(np.concatenate([corners + origin[:, None], z], -1)).float()
-    of_scene = torch.from_numpy(scene) if len(episode.world.scenes) > 1 else None
-    distance = compute_point_distance_to_road_edge(groups, episode.edges, max_pairs=MAX_PAIRS, scenario=of_scene)
-    farthest = distance.amax(-1).double().numpy()
-    if episode.edges.has_edges is None:
-        return farthest
-    return np.where(episode.edges.has_edges.numpy()[scene], farthest, -np.inf)
+    points[..., :2] = corners + episode.origin[rows, None]
+    points[..., 2] = _ground(episode, world, rows)[:, None]
+    distances = np.empty((len(rows), 4), np.float32)
+    measure_road_edge(points.reshape(-1, 3), np.repeat(scene, 4), episode.edges, distances.reshape(-1))
+    return np.where(episode.has_edges[scene], distances.max(1), -np.inf)
 
 
-def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Distance that agents may move by before a corner can be 0.3 m off the road; at most 0 where a corner is.
-
-    The search for the official distance is slow. Where all corners are clearly to the left of the simplified edges of
-    the observations, these decide, unless edges lie above each other.
-    """
-    scene, agent = episode.world.actors[rows].T
-    motion = world.motion[scene, agent]
-    corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
-    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[rows])
-    free = distance.min(1) - SIMPLIFIED_M
-    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_alongside).all(1) | episode.world.has_levels[scene])
-    free += OUTSIDE_M
-    if len(unclear):
-        free[unclear] = OUTSIDE_M - off_road_m(episode, world, rows[unclear])
-    return free
+def _measure(
+    episode: Episode, world: WorldState, previous: Float[np.ndarray, "M 5"], moved: Float[np.ndarray, "M 5"]
+) -> tuple[Bool[np.ndarray, "M A"], Float[np.ndarray, "M 4"]]:
+    """Boxes in reach of each planner-driven agent after a step, and numbers as `measure_steps` has them."""
+    in_reach, measures = np.empty(episode.reach_m.shape, bool), np.empty((episode.num_agents, 4))
+    measure_steps(
+        previous, moved, episode.half_diagonal, episode.world.actors, world.motion,
+        find_presence(episode.world, world, 1)[1][0], episode.reach_m, episode.atlas.route_arrays, in_reach, measures,
+    )  # fmt: skip
+    return in_reach, measures
 
 
-def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 5"]) -> Bool[np.ndarray, "M A"]:
-    """Tracks that each planner-driven agent overlaps now."""
-    tracks = world.motion[episode.world.actors[:, 0]]  # [M, A, 5]
-    gap = tracks[..., :2] - motion[:, None, :2]
-    # few boxes are in reach of each other
-    meets = find_presence(episode.world, world, 1)[1][episode.world.actors[:, 0], :, 0]
-    meets &= np.hypot(gap[..., 0], gap[..., 1]) <= episode.reach_m
-    row, other = np.nonzero(meets)
+def _contacts(
+    episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 5"], in_reach: Bool[np.ndarray, "M A"]
+) -> Bool[np.ndarray, "M A"]:
+    """Tracks that each planner-driven agent overlaps now, among those in reach."""
+    row, other = in_reach.nonzero()  # few boxes are
     if not len(row):
-        return meets
+        return in_reach
     scene, agent = episode.world.actors[row].T
-    size = episode.world.size[scene, other]
-    meets[row, other] = boxes_overlap(gap[row, other], motion[row, 2], tracks[row, other, 2], episode.size[row], size)
+    track, size = world.motion[scene, other], episode.world.size[scene, other]
+    gap = track[:, :2] - motion[row, :2]
+    meets = boxes_overlap(gap, motion[row, 2], track[:, 2], episode.size[row], size)
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
         rise = z[scene, other] - z[scene, agent]
         is_same_level = heights_overlap(rise, height[scene, agent], height[scene, other])
-        meets[row, other] &= is_same_level | ~episode.world.has_levels[scene]
-    return meets
-
-
-def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
-    """Distance of each agent along the route, as `Route.progress`, for all at once."""
-    atlas, row = episode.atlas, np.arange(len(motion))
-    columns = atlas.columns["route"]
-    dx, dy = motion[:, :1] - atlas.x[:, columns], motion[:, 1:2] - atlas.y[:, columns]  # [M, r]; padding is far away
-    nearest = (dx * dx + dy * dy).argmin(1)
-    heading = atlas.route_heading[row, nearest]
-    forward = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
-    return np.where(atlas.route_length > 0, SPACING_M * nearest + forward, 0.0)
+        meets &= is_same_level | ~episode.world.has_levels[scene]
+    contacts = np.zeros(in_reach.shape, bool)
+    contacts[row, other] = meets
+    return contacts

@@ -93,7 +93,7 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
     scene = episode.world.scenes[scene_row]
     count = len(scene.object_id)
     is_present, is_observed = (
-        array[scene_row, :count, CURRENT_STEP:] for array in find_presence(episode.world, state.world)
+        array[CURRENT_STEP:, scene_row, :count].T for array in find_presence(episode.world, state.world)
     )
     return Record(
         scene=replace(scene, lights=find_lights(episode.world, state.world)[scene_row]),
@@ -105,7 +105,7 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         collisions=state.collisions[row],
         route=episode.atlas.routes[row],
         logged_route=find_route(scene.scenario, agent, "logged", scene.num_steps),
-        has_left_map=bool(has_left_map(episode, state.world)[row]),
+        has_left_map=bool(has_left_map(episode, state.world, np.array([row]))[0]),
         traffic=episode.config.model if episode.config.traffic == "policy" else episode.config.traffic,
         is_open=bool(episode.world.open_worlds),
     )

@@ -3,11 +3,14 @@
 Frame: map (centered on the scenario, meters), float64. Built once per scenario and cached with the scenario.
 """
 
+import math
 from dataclasses import dataclass, replace
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from rlftsim.envs.compiled import compiled
 from rlftsim.envs.levels import Levels, build_levels
 from rlftsim.scenario.lane_graph import LaneGraph, lane_graph
 from rlftsim.scenario.polylines import arc_length, resample_to
@@ -250,3 +253,14 @@ def _build_crossings(scenario: Scenario) -> tuple[Float[np.ndarray, "c 8"], Floa
         boxes.append((box @ axes).ravel())
         heights.append(float(polygon[:, 2].mean()))
     return np.array(boxes).reshape(-1, 8), np.array(heights, np.float64)
+
+
+@compiled
+@no_type_check
+def compute_directions(motion):
+    """Unit vectors [B, A, 2] along the headings of agents with a motion [B, A, 5]."""
+    directions = np.empty((motion.shape[0], motion.shape[1], 2))
+    for b in range(motion.shape[0]):
+        for a in range(motion.shape[1]):
+            directions[b, a, 0], directions[b, a, 1] = math.cos(motion[b, a, 2]), math.sin(motion[b, a, 2])
+    return directions

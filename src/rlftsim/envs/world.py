@@ -27,7 +27,7 @@ from torch import Tensor
 
 from rlftsim.envs.drivers import Driver, Rules, assign_drivers
 from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, begin_idm, build_idm_lines
-from rlftsim.envs.scene import Lights, Scene, build_env_scene
+from rlftsim.envs.scene import Lights, Scene, build_env_scene, compute_directions
 from rlftsim.envs.sumo_traffic import SumoScene, SumoState, advance_sumo, begin_sumo, build_sumo_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
@@ -82,10 +82,10 @@ class World:
     """Of the IDM-driven agents of each scene."""
     sumo_scenes: tuple[SumoScene, ...]
     """Of each scene where SUMO drives the others; else empty."""
-    is_present: Bool[np.ndarray, "B A S"]
+    is_present: Bool[np.ndarray, "S B A"]
     """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends. Those
     that have left since are in `WorldState.has_left`."""
-    is_observed: Bool[np.ndarray, "B A S"]
+    is_observed: Bool[np.ndarray, "S B A"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
     """True = heights count in the scene, see `levels`."""
@@ -137,6 +137,8 @@ class WorldState:
 
     track: tuple[Float[np.ndarray, "B A 5"], ...]
     """Motion at every step of the log's time from 0 to the present one."""
+    directions: tuple[Float[np.ndarray, "B A 2"], ...]
+    """Unit vectors along the headings at the same steps."""
     z: tuple[Float[np.ndarray, "B A"], ...]
     """Heights of the centers at the same steps; always those of the current step in scenes without levels."""
     block: Block | None
@@ -235,8 +237,8 @@ def build_world(
         ),
         logged_z=padded([scene.logged_z for scene in scenes], (*shape, num_steps)),
         valid=valid,
-        is_present=is_present,
-        is_observed=is_present & (simulated | valid),
+        is_present=np.moveaxis(is_present, 2, 0).copy(),
+        is_observed=np.moveaxis(is_present & (simulated | valid), 2, 0).copy(),
         has_levels=np.array([scene.levels is not None for scene in scenes]),
         policy=policy if followers else None,
         context=context if followers else None,
@@ -288,7 +290,8 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     has_left = (np.zeros(world.mask.shape, bool),) * (len(track) if leaves else 0)
     if block is not None and block.presences:
         has_left = (block.is_absent,) * len(track)
-    return WorldState(track, z, block, noise, (tuple(dice),), idm_states, sumo_states, has_left)
+    directions = tuple(compute_directions(motion) for motion in track)
+    return WorldState(track, directions, z, block, noise, (tuple(dice),), idm_states, sumo_states, has_left)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
@@ -328,7 +331,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     if len(driven[0]):
         motion[driven] = previous[driven]
         motion[(*driven, slice(3, 5))] = 0.0  # parked ones stay; those with a line move below
-        present = find_presence(world, state, 1)[0][..., 0]
+        present = find_presence(world, state, 1)[0][0]
         moved_states = []
         for b, (scene, lines) in enumerate(zip(world.scenes, world.lines)):
             agents = b, slice(len(scene.object_id))
@@ -361,13 +364,16 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         for b, sumo_state in enumerate(sumo_states):
             left[b, : len(sumo_state.has_left)] |= sumo_state.has_left
         has_left = (*has_left, left)
-    track, heights = (*state.track, motion), (*state.z, z)
-    return WorldState(track, heights, block, state.noise, dice, idm_states, tuple(sumo_states), has_left)
+    directions = (*state.directions, compute_directions(motion))
+    return WorldState(
+        (*state.track, motion), directions, (*state.z, z), block, state.noise, dice, idm_states, tuple(sumo_states),
+        has_left,
+    )  # fmt: skip
 
 
 def find_presence(
     world: World, state: WorldState, num_steps: int | None = None
-) -> tuple[Bool[np.ndarray, "B A T"], Bool[np.ndarray, "B A T"]]:
+) -> tuple[Bool[np.ndarray, "T B A"], Bool[np.ndarray, "T B A"]]:
     """`is_present` and `is_observed` at the last T steps of the log's time up to the present one.
 
     Args:
@@ -377,10 +383,10 @@ def find_presence(
     """
     end = len(state.track)
     steps = slice(0 if num_steps is None else end - num_steps, end)
-    present, observed = world.is_present[..., steps], world.is_observed[..., steps]
+    present, observed = world.is_present[steps], world.is_observed[steps]
     if not state.has_left:
         return present, observed
-    has_left = np.stack(state.has_left[steps], -1)
+    has_left = np.stack(state.has_left[steps])
     return present & ~has_left, observed & ~has_left
 
 
