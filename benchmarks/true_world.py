@@ -14,8 +14,16 @@ import tyro
 from scipy.stats import spearmanr
 from tyro.conf import Positional
 
-from rlftsim.experiments.true_world import CHANGED, arrange_episodes, average
-from rlftsim.experiments.true_world_report import HIT, SCORE, WindowSet, choose_sets, format_cell
+from rlftsim.experiments.true_world import (
+    CHANGED,
+    HIT,
+    SCORE,
+    WindowSet,
+    arrange_episodes,
+    average,
+    choose_sets,
+    format_cell,
+)
 
 STATISTICS = [(column, statistic) for column in (SCORE, HIT) for statistic in ("planner_error", "episode_error")]
 

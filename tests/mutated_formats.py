@@ -48,7 +48,7 @@ from rlftsim.rollout.gates import GateFinder
 from rlftsim.scenario.synthetic import generate, worlds
 from rlftsim.scenario.tfrecord import write_records
 from rlftsim.scenario.transfer import pull_dataset
-from rlftsim.studio.serving import load_token
+from rlftsim.studio.server import load_token
 from rlftsim.submission.entry import describe_entry, read_entry
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics

@@ -7,6 +7,7 @@ from scipy import stats
 from rlftsim.errors import DataError
 from rlftsim.experiments.true_world import (
     arrange_episodes,
+    choose_sets,
     compute_r_squared,
     compute_tau_b,
     count_failures,
@@ -15,7 +16,6 @@ from rlftsim.experiments.true_world import (
     find_largest_errors,
     measure_agreement,
 )
-from rlftsim.experiments.true_world_report import choose_sets
 
 TRUTH = [[1.0, 0.8, 0.6, 0.8], [0.5, 0.5, 0.5, 0.5], [0.0, 0.2, 0.0, 0.2]]
 """Scores of three planners, means 0.8, 0.5 and 0.1, in four windows."""

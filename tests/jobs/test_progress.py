@@ -41,7 +41,7 @@ def test_no_line_of_a_verb_reaches_the_terminal_as_it_is():
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     }
-    assert printing == {"jobs/progress.py", "cli/main.py", "cli/parse.py", "studio/serving.py"}
+    assert printing == {"jobs/progress.py", "cli/main.py", "cli/parse.py", "studio/server.py"}
 
 
 def test_lines_of_a_card_stay_lines_without_control_characters(capsys):

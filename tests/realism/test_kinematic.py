@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity, wrap_angle
+from rlftsim.realism.features import compute_ground_speed, compute_kinematics, shrink_validity, wrap_angle
 
 
 def test_constant_acceleration_along_a_slope_gives_speed_and_acceleration_in_space():

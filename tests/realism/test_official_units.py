@@ -8,8 +8,8 @@ from realism_drawing import draw_map
 from rlftsim.realism import METRIC_2025
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.config import HISTOGRAM_FEATURES
+from rlftsim.realism.features import compute_ground_speed, compute_kinematics, shrink_validity
 from rlftsim.realism.interactive import PlanarAgents, compute_distance_to_nearest_object, compute_time_to_collision
-from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity
 from rlftsim.realism.likelihood import (
     LogTarget,
     RolloutCounts,

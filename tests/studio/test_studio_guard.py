@@ -14,8 +14,7 @@ import pytest
 
 from rlftsim.errors import ConfigError
 from rlftsim.studio.guard import Access
-from rlftsim.studio.server import create_app, static_files, static_hash
-from rlftsim.studio.serving import Studio, load_token
+from rlftsim.studio.server import Studio, create_app, load_token, static_files, static_hash
 
 HOST = "127.0.0.1:4711"
 READS = ["/", f"/static/{static_hash()}/main.js", "/api/session", "/api/scenarios?split=validation", "/api/runs/x"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rlftsim.studio.serving import Studio
+from rlftsim.studio.server import Studio
 
 SCENARIO = "9d639de83d6f5239"
 EGO = 179

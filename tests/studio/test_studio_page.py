@@ -21,8 +21,7 @@ from rlftsim.goals.goals_file import read_goals
 from rlftsim.rollout.types import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.studio.notebook import NOTEBOOK_ORIGINS, StudioCell
-from rlftsim.studio.server import static_files
-from rlftsim.studio.serving import Studio
+from rlftsim.studio.server import Studio, static_files
 
 SCENARIO = "9d639de83d6f5239"
 EGO = 179

@@ -10,7 +10,7 @@ import pytest
 from rlftsim.studio import server
 from rlftsim.studio.bodies import RunBody
 from rlftsim.studio.runs import Run
-from rlftsim.studio.serving import Studio
+from rlftsim.studio.server import Studio
 
 BODY = RunBody("validation", "9d639de83d6f5239", ("demo-base",))
 

@@ -11,8 +11,7 @@ import pytest
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.submission import check
-from rlftsim.submission.check import check_archive
-from rlftsim.submission.findings import CHECKS
+from rlftsim.submission.check import CHECKS, check_archive
 from rlftsim.submission.messages import decode_rollouts
 from rlftsim.submission.report import SERVER_ERRORS, write_findings
 

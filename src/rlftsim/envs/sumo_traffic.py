@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int64
 from rlftsim.envs.scene import GREEN, RED, YELLOW, Lights, Scene
 from rlftsim.errors import ConfigError, DataError, EpisodeFailure
 from rlftsim.jobs.documents import parse_json
-from rlftsim.scenario.synthetic.causal import BodyState, SumoPose, advance_body
+from rlftsim.scenario.synthetic.bodies import BodyState, SumoPose, advance_body
 from rlftsim.scenario.synthetic.crop import on_grid
 from rlftsim.scenario.synthetic.windows import HEADING_GRID_PER_RAD, POSITION_GRID_PER_M, VELOCITY_GRID_PER_MPS
 from rlftsim.scenario.synthetic.worlds import REMEDY, WindowSource, find_window

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from rlftsim.evaluation.compare import Comparison, compare, format_table
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.evaluation.model_report import build_report
-from rlftsim.evaluation.report import write_report
+from rlftsim.evaluation.report import build_report, write_report
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.scenario_pages import EvaluatedModels
 from rlftsim.jobs.folder import check_folder

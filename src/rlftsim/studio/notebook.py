@@ -13,7 +13,7 @@ from rlftsim.scenario.open import Name
 from rlftsim.studio import check_extra
 
 if TYPE_CHECKING:
-    from rlftsim.studio.serving import Studio
+    from rlftsim.studio.server import Studio
 
 FRAME_HEIGHT = 760
 NOTEBOOK_ORIGINS = ("http://localhost:*", "http://127.0.0.1:*")
@@ -83,7 +83,7 @@ def open_studio(
     """
     check_extra()
     # Not at the top: `import rlftsim` works without the extra.
-    from rlftsim.studio.serving import Studio
+    from rlftsim.studio.server import Studio
     from rlftsim.studio.session import Session
 
     names, files = _to_names("models", models), _to_names("rollouts", rollouts)

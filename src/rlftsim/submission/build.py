@@ -26,7 +26,7 @@ from rlftsim.jobs.runner import Advance, Runner, check_jobs, choose_runner, sele
 from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.batch import collate
 from rlftsim.submission.archive import PackedShard, count_joined, join_shards, pack_shard
-from rlftsim.submission.findings import check_rollouts
+from rlftsim.submission.check import check_rollouts
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
 from rlftsim.submission.plan import GZIP_RATIO, PLAN, SHARDS, Job, Plan
 

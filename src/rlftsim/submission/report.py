@@ -32,8 +32,7 @@ from rlftsim.realism import (
 )
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-from rlftsim.submission.check import ArchiveCheck
-from rlftsim.submission.findings import CHECKS
+from rlftsim.submission.check import CHECKS, ArchiveCheck
 from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
 BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}

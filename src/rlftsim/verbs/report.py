@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.model_report import build_report
-from rlftsim.evaluation.report import write_report
+from rlftsim.evaluation.report import build_report, write_report
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.scenario_pages import EvaluatedModels
 from rlftsim.evaluation.scenario_source import hash_manifest

@@ -56,7 +56,7 @@ def studio(
             "meant, or use ssh -L."
         )
     check_extra()
-    from rlftsim.studio.serving import Studio, announce, load_token
+    from rlftsim.studio.server import Studio, announce, load_token
     from rlftsim.studio.session import Session
 
     if host not in LOOPBACK:

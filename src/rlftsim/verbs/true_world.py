@@ -53,8 +53,7 @@ def true_world(
     from rlftsim.envs.true_world_episode import PLANNERS
     from rlftsim.envs.true_world_films import write_films
     from rlftsim.envs.true_world_traffic import Surroundings
-    from rlftsim.experiments.true_world import arrange_episodes, find_largest_errors
-    from rlftsim.experiments.true_world_report import REFERENCES, SCORE, write_report
+    from rlftsim.experiments.true_world import REFERENCES, SCORE, arrange_episodes, find_largest_errors, write_report
 
     learned = list(map(Surroundings.parse, filter(None, models.split(","))))
     if whole_number("films", films, 0) and not learned:

@@ -28,8 +28,7 @@ from rlftsim.scenario.dataset import (
 )
 from rlftsim.scenario.shards import ShardReader, ShardWriter, check_scenario
 from rlftsim.scenario.synthetic import sumo
-from rlftsim.scenario.synthetic.windows import cut_windows
-from rlftsim.scenario.synthetic.world import simulate_world
+from rlftsim.scenario.synthetic.windows import cut_windows, simulate_world
 from rlftsim.scenario.synthetic.worlds import WORLDS, write_world
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS, Scenario
 

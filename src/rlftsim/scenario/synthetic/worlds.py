@@ -15,7 +15,7 @@ from zlib import error as ZlibError
 from rlftsim.errors import DataError
 from rlftsim.jobs.documents import MAX_TEXT_BYTES, first_line, parse_json
 from rlftsim.jobs.files import write_atomically
-from rlftsim.scenario.synthetic.causal import BodyShape, BodyState
+from rlftsim.scenario.synthetic.bodies import BodyShape, BodyState
 from rlftsim.scenario.synthetic.sumo import DISCARDED_S, OPTIONS, SIMULATED_S, sumo_version
 from rlftsim.scenario.synthetic.windows import Window, World
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
