@@ -36,7 +36,7 @@ from rlftsim.evaluation.learning_curve import write_calibration_picture
 from rlftsim.evaluation.reward_variance import measure_variances
 from rlftsim.experiments.exam import Ledger
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
-from rlftsim.goals.stored import StoredGoals, write_goal_file
+from rlftsim.goals.types import StoredGoals, write_goal_file
 from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk, write_catk_vocabulary

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from rlftsim.envs import EgoEnv
-from rlftsim.envs.planner_scores import missing_scores
-from rlftsim.envs.traffic_scores import compute_traffic_realism
+from rlftsim.envs.planner_scores import compute_traffic_realism, missing_scores
 from rlftsim.realism import score
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.scenario.types import ObjectType

@@ -11,8 +11,7 @@ import scenes
 import tiny
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.goals.attainment import is_reached
-from rlftsim.goals.stored import StoredGoals, write_goal_file
-from rlftsim.goals.types import Goals, logged_goals
+from rlftsim.goals.types import Goals, StoredGoals, logged_goals, write_goal_file
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rewards import parse_reward, reward_by_name, write_reward
 from rlftsim.rewards.base import agent_rewards_by_name

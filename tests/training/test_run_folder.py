@@ -13,10 +13,9 @@ import tiny
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.rollout.edge_scenes import move_scenario
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.training.board import write_film
 from rlftsim.training.config import FinetuneConfig, KlConfig
 from rlftsim.training.run_folder import RunFolder, describe_inputs, read_metrics, to_plain
-from rlftsim.training.trackers import board_tag
+from rlftsim.training.trackers import board_tag, write_film
 
 
 def test_the_folder_holds_the_resolved_configuration_and_the_environment(tmp_path):

@@ -13,11 +13,11 @@ from rlftsim.envs.config import MAX_STEPS, EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.planner_episode import run_batch, run_planner
+from rlftsim.envs.planner_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.envs.planners.batch import acts_in_batches
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.result import SCORE_NAMES, Result
 from rlftsim.envs.source import Source, check_choice
-from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.errors import ConfigError, EpisodeFailure, in_short, whole_number
 from rlftsim.evaluation.drive_results import FAILED
 from rlftsim.jobs.progress import log

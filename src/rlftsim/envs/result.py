@@ -8,9 +8,8 @@ from os import PathLike
 import numpy as np
 
 from rlftsim.envs.episode import Episode, EpisodeState
-from rlftsim.envs.planner_scores import PlannerScores, missing_scores, score_planner
+from rlftsim.envs.planner_scores import PlannerScores, TrafficScores, missing_scores, score_planner, score_traffic
 from rlftsim.envs.record import Record, build_record
-from rlftsim.envs.traffic_scores import TrafficScores, score_traffic
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS
 from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html

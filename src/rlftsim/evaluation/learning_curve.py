@@ -9,8 +9,8 @@ from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
-from rlftsim.training.board import write_film
 from rlftsim.training.run_folder import read_metrics
+from rlftsim.training.trackers import write_film
 from rlftsim.viewer.chart import Chart, Curve
 from rlftsim.viewer.figure import Interval, charts_to_png, draw_intervals, save_figure
 from rlftsim.viewer.film import Camera

@@ -16,8 +16,7 @@ from rlftsim.rewards.base import (
     register_sum,
     reward_by_name,
 )
-from rlftsim.rewards.composition import Rewards, compute_rewards
-from rlftsim.rewards.expression import Term, parse_reward, write_reward
+from rlftsim.rewards.expression import Rewards, Term, compute_rewards, parse_reward, write_reward
 from rlftsim.rewards.goal import goal_terms
 
 __all__ = [

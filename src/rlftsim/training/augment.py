@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError
-from rlftsim.goals.stored import read_goal_file, write_goal_file
-from rlftsim.goals.types import logged_goals
+from rlftsim.goals.types import logged_goals, read_goal_file, write_goal_file
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.goals.stored import StoredGoals
-from rlftsim.goals.types import Goals, logged_goals
+from rlftsim.goals.types import Goals, StoredGoals, logged_goals
 from rlftsim.jobs.progress import log
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, is_goal_conditioned

@@ -7,23 +7,68 @@ A tracker that fails, takes too long or is not installed costs a warning. Names 
 mine = "my_package:MyTracker"
 """
 
+import io
 import json
 import os
 import uuid
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+from PIL import Image
 
 from rlftsim.errors import ConfigError, DataError, shorten
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.progress import log
 from rlftsim.plugins import ExtensionPoint, import_object
-from rlftsim.training.board import write_settings
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+COMPARED = ("validation/validation_rmm", "realism/rmm", "loss")
+"""Metrics, by their names in TensorBoard, beside the hyper-parameters of runs."""
+
+
+def write_settings(board: "SummaryWriter", settings: Mapping[str, Any]) -> None:
+    """Add the settings of a run, as a table of text and as hyper-parameters to compare runs.
+
+    Args:
+        board: Open writer of the run's events.
+        settings: Values by dotted name.
+    """
+    from torch.utils.tensorboard.summary import hparams  # not at the top: `--help` has no use for it
+
+    values = {name: value if isinstance(value, bool | int | float | str) else json.dumps(value)
+              for name, value in settings.items()}  # fmt: skip
+    rows = [f"| {name} | {str(value).replace('|', ' ')} |" for name, value in values.items()]
+    board.add_text("settings", "\n".join(["| setting | value |", "|---|---|", *rows]), 0)
+    # SummaryWriter.add_hparams would open a run of its own for them
+    for summary in hparams(values, dict.fromkeys(COMPARED, 0.0)):
+        board._get_file_writer().add_summary(summary)
+
+
+def write_film(board: "SummaryWriter", frames: Sequence[np.ndarray], step: int, frame_s: float) -> None:
+    """Add a film, which plays among the pictures.
+
+    Args:
+        board: Open writer of the run's events.
+        frames: Pictures [height, width, 3] of equal size, uint8.
+        step: Number of updates done.
+        frame_s: Seconds that a frame stays.
+    """
+    from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue] (generated)
+
+    film, (first, *later) = io.BytesIO(), [Image.fromarray(frame) for frame in frames]
+    first.save(film, format="GIF", save_all=True, append_images=later, duration=round(1000 * frame_s), loop=0)
+    image = Summary.Image(height=first.height, width=first.width, colorspace=3, encoded_image_string=film.getvalue())
+    board._get_file_writer().add_summary(Summary(value=[Summary.Value(tag="film", image=image)]), step)
+
 
 IDS = "trackers.json"
 """File of a run folder with the id of the run in each tracker."""
