@@ -3,6 +3,7 @@
 Credentials are found by the libraries themselves; this module never reads, keeps or prints credentials.
 """
 
+import fcntl
 import hashlib
 import os
 import re
@@ -269,12 +270,7 @@ def _locked(path: Path) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a")
     with file:
-        try:
-            import fcntl
-
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX)
-        except ImportError:  # no such locks on this platform: a shard may be fetched twice
-            pass
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
         yield
 
 

@@ -81,7 +81,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         try:
             temporary.parent.mkdir(parents=True, exist_ok=True)
             for process, leftover in _list_temporaries(temporary.parent).pop(target.name, ()):
-                if os.name == "posix" and not _is_running(process):  # elsewhere the question ends the process
+                if not _is_running(process):
                     leftover.unlink(missing_ok=True)
             write(temporary)
             # On disk before it gets the name: after a power cut the name must not stand for an empty file.
@@ -187,8 +187,7 @@ def _is_left(name_and_host: str, process: int, names: Collection[str]) -> bool:
     name = name_and_host.removesuffix(f".{socket.gethostname()}")
     if name == name_and_host:  # of another machine, whose name may have dots as the file's may
         return any(name.startswith(f"{output}.") for output in names)
-    is_asked = process != os.getpid() and os.name == "posix"  # elsewhere the question ends the process
-    return name in names and not (is_asked and _is_running(process))
+    return name in names and (process == os.getpid() or not _is_running(process))
 
 
 def _is_running(process: int) -> bool:

@@ -7,6 +7,7 @@ locks two drivers at a time are not noticed.
 """
 
 import errno
+import fcntl
 import json
 import os
 import re
@@ -260,11 +261,7 @@ class Lease:
                         f"{path.parent}: another process has just finished this work: nothing is left to do."
                     ) from None
                 try:
-                    import fcntl
-
                     fcntl.flock(file.fileno(), (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-                except ImportError:  # no such locks on this platform: two drivers at a time are not noticed
-                    pass
                 except BlockingIOError:
                     with file:
                         if time.monotonic() >= deadline:

@@ -4,6 +4,7 @@ The only module that opens Parquet or Arrow files. Arrow trusts the offsets and 
 validated: a wrong offset is followed out of the file, which ends the process.
 """
 
+import resource
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -116,10 +117,8 @@ def _limited_memory(num_bytes: int) -> Iterator[None]:
     The sizes in a file do not tell what pyarrow will take: a text of a megabyte that is repeated is stored once.
     """
     try:
-        import resource
-
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    except (ImportError, OSError):  # no such limits, or no such file, on this platform
+    except OSError:  # no such file on this platform
         yield
         return
     with _memory_limit:

@@ -98,8 +98,7 @@ class DatasetStats:
     kilobytes_per_scenario: float
     """Size of all shards over the scenarios in them, in units of 1000 bytes."""
     speeds: Mapping[str, SpeedStats]
-    """By type of agent, from `num_speed_scenarios` scenarios."""
-    num_speed_scenarios: int
+    """By type of agent, from `MAX_SPEED_SCENARIOS` scenarios at most."""
     by_source: Mapping[str, int]
     by_guessed: Mapping[str, int]
     """Scenarios in which a value is guessed, by the word for it."""
@@ -168,7 +167,6 @@ def dataset_stats(folder: str | os.PathLike[str], *, split: str | None = None) -
         percent_with_lights=100.0 * sum(n > 0 for n in index["num_light_states"].to_pylist()) / num_scenarios,
         kilobytes_per_scenario=total_bytes / total_rows / 1000.0,
         speeds=_compute_speeds(dataset, positions),
-        num_speed_scenarios=len(positions),
         by_guessed=_count([word for words in index["guessed"].to_pylist() for word in words.split()]),
     )
 

@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 from jaxtyping import Float
+from scipy.signal import savgol_filter
 
 from rlftsim.errors import DataError
 from rlftsim.viewer.page import embed_json
@@ -114,18 +115,9 @@ def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"
 
     Args:
         values: Values [n] at equal distances.
-        window: Number of fitted points around each point; near the ends, points of mostly one side.
+        window: Odd number of fitted points around each point; near the ends, points of mostly one side.
     """
-    smoothed = np.array(values, float)  # [n]
-    window = min(window, len(smoothed))
-    for i in range(len(smoothed)):
-        start = min(max(i - window // 2, 0), len(smoothed) - window)
-        neighbors = np.arange(start, start + window)
-        offset = neighbors - neighbors.mean()
-        # The maximum avoids 0 / 0 for a window of one point, whose slope does not matter.
-        slope = offset @ values[neighbors] / max(float(offset @ offset), 1.0)
-        smoothed[i] = values[neighbors].mean() + slope * (i - neighbors.mean())
-    return smoothed
+    return np.asarray(values if window == 1 else savgol_filter(values, window, polyorder=1), float)
 
 
 def css_color(index: int) -> str:

@@ -3,7 +3,6 @@
 import importlib.util
 import re
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -44,8 +43,7 @@ def find_binary(name: str) -> Path:
     package = importlib.util.find_spec("sumo")
     if package is None or not package.submodule_search_locations:
         raise ConfigError(INSTALL_HINT)
-    suffix = ".exe" if sys.platform == "win32" else ""
-    path = Path(next(iter(package.submodule_search_locations))) / "bin" / f"{name}{suffix}"
+    path = Path(next(iter(package.submodule_search_locations))) / "bin" / name
     if not path.exists():
         raise ConfigError(f"{path} is missing: reinstall eclipse-sumo. {INSTALL_HINT}")
     return path
