@@ -19,7 +19,7 @@ MAX_DRAWN_POINTS = 600
 MIN_POINTS_TO_SMOOTH = 12
 NUM_SERIES_COLORS = 4
 DRAWN_MAGNITUDE = 1e30
-"""Values farther from zero count as not finite; on a logarithmic axis also values closer to zero than 1 over this."""
+"""Values farther from zero count as not finite."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,6 @@ class Chart:
     x_label: str
     y_label: str
     curves: Sequence[Curve]
-    log_y: bool = False
-    """Powers of ten; values that are not positive are left out."""
     reference: tuple[str, float] | None = None
     """Name and height of a dashed horizontal line, such as the KL target."""
     note: str = ""
@@ -52,13 +50,12 @@ class Chart:
 
 @dataclass(frozen=True)
 class Axes:
-    """Limits of both axes, and positions of values in between. Vertical limits are logarithms where `log_y`."""
+    """Limits of both axes, and positions of values in between."""
 
     x_low: float
     x_high: float
     y_low: float
     y_high: float
-    log_y: bool
 
     def horizontal(self, x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of x."""
@@ -68,15 +65,14 @@ class Axes:
 
     def vertical(self, y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of y."""
-        height = np.log10(y) if self.log_y else np.asarray(y, float)
-        fraction = (height - self.y_low) / (self.y_high - self.y_low)
+        fraction = (np.asarray(y, float) - self.y_low) / (self.y_high - self.y_low)
         # SVG counts from the top.
         return np.asarray(HEIGHT - BOTTOM - fraction * (HEIGHT - TOP - BOTTOM))
 
 
 def chart_html(chart: Chart) -> str:
     """A `<figure>` with title, legend (for more than one curve), SVG and note."""
-    curves = [(curve.name, *_select_points(curve, chart.log_y)) for curve in chart.curves]  # name, x [n], y [n]
+    curves = [(curve.name, *_select_points(curve)) for curve in chart.curves]  # name, x [n], y [n]
     title = f'<figcaption class="chart-title">{escape(chart.title)}</figcaption>'
     note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
     if not any(len(x) for _, x, _ in curves):
@@ -84,7 +80,7 @@ def chart_html(chart: Chart) -> str:
     axes = _compute_axes(curves, chart)
     shapes = [_frame_svg(axes, chart)]
     shapes += [_curve_svg(axes, x, y, css_color(index)) for index, (_, x, y) in enumerate(curves)]
-    if chart.reference and not (chart.log_y and chart.reference[1] <= 0):
+    if chart.reference:
         name, height = chart.reference
         y = float(axes.vertical(np.array(height)))
         shapes.append(f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
@@ -168,11 +164,11 @@ def format_tick(value: float, step: float) -> str:
     return f"{value:,.{digits}f}".replace("-", "−").replace(",", "\u202f")
 
 
-def _select_points(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
+def _select_points(curve: Curve) -> tuple[np.ndarray, np.ndarray]:
     """Points that can be drawn, x and y [n], averaged over neighbors where there are very many."""
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
     # Comparisons with NaN are False, so y needs no separate isfinite.
-    is_drawable = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE) & ((y > 1 / DRAWN_MAGNITUDE) if log_y else True)
+    is_drawable = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE)
     x, y = x[is_drawable], y[is_drawable]
     if len(x) <= MAX_DRAWN_POINTS:
         return x, y
@@ -180,11 +176,9 @@ def _select_points(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
 
 
-def _smoothed(y: np.ndarray, log_y: bool) -> np.ndarray:
-    """Values smoothed on the scale of the drawing, never beyond the raw values: a rate stays above zero."""
-    height = np.log10(y) if log_y else y
-    smoothed = np.clip(smooth(height, _window(len(y))), height.min(), height.max())
-    return 10**smoothed if log_y else smoothed
+def _smoothed(y: np.ndarray) -> np.ndarray:
+    """Smoothed values, never beyond the raw values: a rate stays above zero."""
+    return np.clip(smooth(y, _window(len(y))), y.min(), y.max())
 
 
 def _window(num_points: int) -> int:
@@ -198,19 +192,18 @@ def _compute_axes(curves: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart
     heights = []
     for _, _, y in curves:
         if len(y):
-            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *_smoothed(y, chart.log_y)]
+            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *_smoothed(y)]
     if chart.reference:
         heights.append(chart.reference[1])
-    y = np.array([h for h in heights if h > 0]) if chart.log_y else np.array(heights)
-    y = np.log10(y) if chart.log_y else y
+    y = np.array(heights)
     # A constant curve gets a margin of its own, or the axis would have no extent.
     margin = 0.06 * (y.max() - y.min()) or max(0.05 * abs(float(y[0])), 1e-3)
     wide = float(x.max()) if x.max() > x.min() else float(x.min()) + 1
     low = float(y.min() - margin)
     # The margin must not suggest that a rate or a loss can be negative.
-    if not chart.log_y and low < 0 <= y.min():
+    if low < 0 <= y.min():
         low = 0.0
-    return Axes(float(x.min()), wide, low, float(y.max() + margin), chart.log_y)
+    return Axes(float(x.min()), wide, low, float(y.max() + margin))
 
 
 def _frame_svg(axes: Axes, chart: Chart) -> str:
@@ -218,7 +211,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
     shapes = []
     # 1. Horizontal grid lines with their values.
-    for value, label in _vertical_ticks(axes):
+    for value, label in label_ticks(axes.y_low, axes.y_high, 5):
         y = float(axes.vertical(np.array(value)))
         shapes.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
         shapes.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
@@ -238,18 +231,6 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     return "".join(shapes)
 
 
-def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
-    """Values to mark on the vertical axis, with labels."""
-    if not axes.log_y:
-        return label_ticks(axes.y_low, axes.y_high, 5)
-    # Powers of ten, at most about five of them; over less than two decades also their double and fivefold.
-    decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
-    multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
-    exponents = [(m, d) for d in decades[:: max(1, len(decades) // 5)] for m in multiples]
-    marks = [m * 10.0**d for m, d in exponents if axes.y_low <= math.log10(m) + d <= axes.y_high]
-    return [(v, f"{v:.3g}".replace("-", "−")) for v in marks]
-
-
 def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> str:
     """Raw line, pale, and smoothed line; dots where points are too few to smooth."""
     if not len(x):
@@ -260,7 +241,7 @@ def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> str:
     if window == 1:
         dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{color}"/>' for a, b in zip(across, down))
         return f'<path class="smooth" d="{raw}" stroke="{color}"/>{dots}'
-    smoothed = _path(across, axes.vertical(_smoothed(y, axes.log_y)))
+    smoothed = _path(across, axes.vertical(_smoothed(y)))
     # A nested svg clips what lies outside its box: the most extreme raw points.
     box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
     frame = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())

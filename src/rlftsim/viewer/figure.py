@@ -239,7 +239,7 @@ def charts_to_png(path: Path, charts: Sequence[Chart]) -> None:
     figure = Figure(figsize=(width * len(charts), height), layout="constrained")
     for axis, chart in zip(figure.subplots(1, len(charts), squeeze=False)[0], charts):
         axis.set_title(chart.title, fontsize=11, loc="left", fontweight="bold")
-        axis.set(xlabel=chart.x_label, ylabel=chart.y_label, yscale="log" if chart.log_y else "linear")
+        axis.set(xlabel=chart.x_label, ylabel=chart.y_label)
         axis.grid(alpha=0.3)
         for index, curve in enumerate(chart.curves):
             # A short curve may be a single point, which a line alone would not show.
