@@ -682,7 +682,7 @@ FORMATS: Mapping[str, Format] = {
         lambda folder: run("goals", "check", folder / "goals.json", "--data", folder / "set"),
         ("goals.goals_file",),
     ),
-    "augmented goals": Format({"goals/*": "parquet"}, make_stored_goals, read_stored_goals, ("goals.stored",)),
+    "augmented goals": Format({"goals/*": "parquet"}, make_stored_goals, read_stored_goals, ("goals.types",)),
     "evaluation": Format({"b.parquet": "parquet"}, make_evaluations, read_evaluations, ("evaluation.results",)),
     "finished evaluation": Format(
         {"out/*.parquet": "parquet"}, make_finished_evaluation, evaluate, ("evaluation.results",)
@@ -743,7 +743,7 @@ FORMATS: Mapping[str, Format] = {
         {"token": "text"},
         lambda folder: load_token(folder / "token"),
         lambda folder: load_token(folder / "token"),
-        ("studio.serving",),
+        ("studio.server",),
     ),
 }
 """All formats by name."""

@@ -35,7 +35,7 @@ NO_FORMAT = {
     "jobs.tables": "for modules that know the format",
     "policies.shipped.__init__": "weights in the box",
     "scenario.synthetic.bodies": "what SUMO has just written",
-    "scenario.synthetic.world": "what SUMO has just written",
+    "scenario.synthetic.windows": "what SUMO has just written",
     "scenario.synthetic.rerun": "a process of its own: what `worlds` has read before, and poses from this program",
     "envs.sumo_traffic": "bytes of this program's own processes",
     "evaluation.explain_page": "whether a page that it moves has an end",

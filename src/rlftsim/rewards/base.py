@@ -8,7 +8,7 @@ inside. A new reward, in a notebook or in a separate package:
         return leave_one_out(-realism.rollout_collision_rate)
 
 Keyword-only parameters with defaults become options: "quiet(scale=2)". A second function may split the reward
-over agents, shape [B, N, A], for credit assignment by agent (`rewards.composition`); the sum over agents has to
+over agents, shape [B, N, A], for credit assignment by agent (`rewards.expression`); the sum over agents has to
 equal the reward:
 
     @register_agent_rewards("quiet")

@@ -28,7 +28,7 @@ from rlftsim.training.run_folder import RunFolder, describe_inputs
 
 @dataclass(frozen=True)
 class _GoalFiles(GroupFormat[Path, tuple[str, Any]]):
-    """Ids and `Points` of some scenarios, see `goals.stored`."""
+    """Ids and `Points` of some scenarios, see `goals.types`."""
 
     folder: Path
     size: int
@@ -60,7 +60,7 @@ def augment_goals(
     Args:
         policy: Policy that the rollouts are sampled from.
         scenarios: Scenarios with logged futures, by which realism is measured.
-        folder: Folder of the files, made if missing, see `goals.stored`.
+        folder: Folder of the files, made if missing, see `goals.types`.
         config: Number of rollouts, sampling, metric, seed; a stored folder is continued only with equal settings.
         runner: Runner of the work; changes no result.
 
