@@ -5,6 +5,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from rlftsim.evaluation.compare import PairedDifference
 from rlftsim.evaluation.report import (
     ChartGroup,
     PairedComparison,
@@ -62,6 +63,12 @@ def draw_animation() -> Animation:
     return Animation("A drive", scene, [Panel("Logged", motion), Panel("Base", motion), Panel("Fine-tuned", motion)])
 
 
+def gained(difference: float, interval: tuple[float, float], p_value: float, count: int) -> PairedDifference:
+    """Difference in RMM, without a standard error where there is no interval."""
+    error = 0.01 if math.isfinite(p_value) else math.nan
+    return PairedDifference("meta_metric", count, 0.7, 0.7 + difference, difference, error, interval, p_value, 0.05)
+
+
 @pytest.fixture
 def report() -> Report:
     loss = Curve("training", range(100), np.exp(-np.arange(100) / 30))
@@ -75,9 +82,7 @@ def report() -> Report:
             ),
             ResultRow("oracle", {"meta_metric": measured(0.9, 0.01)}, note="the log"),
         ],
-        comparisons=[
-            PairedComparison("base", "fine-tuned", 0.02, (0.01, 0.03), 0.0004, 3, differences=[0.01, 0.02, 0.03])
-        ],
+        comparisons=[PairedComparison("base", "fine-tuned", gained(0.02, (0.01, 0.03), 0.0004, 3), [0.01, 0.02, 0.03])],
         chart_groups=[ChartGroup("Pre-training", [Chart("Loss", "update", "nats", [loss])])],
         animations=[draw_animation(), draw_animation()],
         facts={"command": "rlftsim demo <quick>"},
@@ -154,21 +159,19 @@ def test_missing_and_undefined_numbers_are_dashes():
     [((0.01, 0.03), "scores higher"), ((-0.03, -0.01), "scores lower"), ((-0.01, 0.03), "No difference")],
 )
 def test_verdict_follows_the_interval(interval, words):
-    comparison = PairedComparison("base", "fine-tuned", 0.01, interval, 0.04, 20)
+    comparison = PairedComparison("base", "fine-tuned", gained(0.01, interval, 0.04, 20))
     assert words in comparison.verdict_text
     assert words in report_html(Report("t", comparisons=[comparison]))
 
 
-def test_own_verdict_is_kept():
-    comparison = PairedComparison("a", "b", 0.01, (0.0, 0.1), 0.5, 2, verdict="Too few to tell.")
-    assert comparison.verdict_text == "Too few to tell."
+def test_a_difference_that_cannot_be_tested_says_why():
+    comparison = PairedComparison("a", "b", gained(0.01, (math.nan, math.nan), math.nan, 1))
+    assert comparison.verdict_text == "RMM: no verdict: a single scenario, which differs by +0.0100."
+    assert "paired t-test" not in report_html(Report("t", comparisons=[comparison]))
 
 
 def test_a_difference_without_an_interval_is_drawn_without_one():
-    nothing = (float("nan"), float("nan"))
-    comparison = PairedComparison(
-        "a", "b", 0.01, nothing, nothing[0], 2, differences=[0.0, 0.02], verdict="One network."
-    )
+    comparison = PairedComparison("a", "b", gained(0.01, (math.nan, math.nan), math.nan, 2), [0.0, 0.02])
     page = report_html(Report("t", comparisons=[comparison]))
     assert "nan" not in page
     assert page.count("<circle") == 3

@@ -38,7 +38,7 @@ TIMES = ("seconds", "time")
 class PretendFabric:
     """One process on the pretend device."""
 
-    device, world_size, global_rank, is_global_zero = DEVICE, 1, 0, True
+    device, world_size, global_rank = DEVICE, 1, 0
 
     def autocast(self):
         return nullcontext()

@@ -14,7 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from rlftsim.evaluation.columns import COLUMNS, DRIFT_COLUMNS, SCORES, Column, format_number
-from rlftsim.evaluation.compare import Comparison, compare, paired_values
+from rlftsim.evaluation.compare import Comparison, PairedDifference, compare, paired_values
 from rlftsim.evaluation.learning_curve import run_charts, write_calibration_picture
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.scenario_pages import EvaluatedModels, write_scenario_files
@@ -40,48 +40,31 @@ class ResultRow:
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """Two policies on the same scenarios: mean of the differences `second - first` in RMM."""
+    """Two policies on the same scenarios: the differences `second - first` in RMM."""
 
     first: str
     second: str
-    mean_difference: float
-    interval: tuple[float, float]
-    """95 %."""
-    p_value: float
-    num_scenarios: int
-    test: str = "paired t-test"
+    gain: PairedDifference
     differences: Sequence[float] | np.ndarray = ()
     """One per scenario; drawn where given."""
-    verdict: str = ""
-    """A sentence; empty = written from the interval."""
 
     @classmethod
     def of(cls, comparison: Comparison) -> "PairedComparison":
         """The realism meta-metric of a comparison."""
-        difference = comparison["meta_metric"]
         _, scores_a, scores_b = paired_values(comparison.a, comparison.b, "meta_metric")
-        return cls(
-            comparison.a.name,
-            comparison.b.name,
-            difference.difference,
-            difference.interval,
-            difference.p_value,
-            difference.count,
-            test=f"by {difference.num_clusters} street networks" if difference.num_clusters else "paired t-test",
-            differences=scores_b - scores_a,
-            verdict="" if math.isfinite(difference.p_value) else f"RMM: {difference.verdict}",
-        )
+        return cls(comparison.a.name, comparison.b.name, comparison["meta_metric"], scores_b - scores_a)
 
     @property
     def tone(self) -> Literal["good", "bad", ""]:
         """Good if the whole interval lies above zero, bad if below."""
-        return "good" if self.interval[0] > 0 else "bad" if self.interval[1] < 0 else ""
+        low, high = self.gain.interval
+        return "good" if low > 0 else "bad" if high < 0 else ""
 
     @property
     def verdict_text(self) -> str:
-        """`verdict`, or a sentence made from the interval."""
-        if self.verdict:
-            return self.verdict
+        """A sentence made from the interval, or the reason why there is none."""
+        if not math.isfinite(self.gain.p_value):
+            return f"RMM: {self.gain.verdict}"
         if self.tone:
             word, side = ("higher", "above") if self.tone == "good" else ("lower", "below")
             return (
@@ -213,14 +196,15 @@ def _tiles_html(report: Report) -> str:
         if estimate is not None and math.isfinite(estimate.mean):
             limits = _interval_text(estimate.interval)
             tiles.append(tile_html(f"RMM, {name}", format_number(estimate.mean, 4), limits))
-    limits = _interval_text(comparison.interval)
-    tiles.append(tile_html("mean paired difference", _format_signed(comparison), limits, comparison.tone))
+    limits = _interval_text(comparison.gain.interval)
+    tiles.append(
+        tile_html("mean paired difference", _format_signed(comparison.gain.difference), limits, comparison.tone)
+    )
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
-def _format_signed(comparison: PairedComparison) -> str:
-    sign = "+" if comparison.mean_difference > 0 else ""
-    return sign + format_number(comparison.mean_difference, 4)
+def _format_signed(difference: float) -> str:
+    return ("+" if difference > 0 else "") + format_number(difference, 4)
 
 
 def _interval_text(interval: tuple[float, float]) -> str:
@@ -293,25 +277,27 @@ def _link(address: str, text: str) -> str:
 
 
 def _comparison_html(comparison: PairedComparison) -> str:
-    p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
-    tested = f"{_interval_text(comparison.interval)}, {p_text} ({escape(comparison.test)}), "
+    gain = comparison.gain
+    p_text = "p < 0.0001" if gain.p_value < 1e-4 else f"p = {gain.p_value:.2g}"
+    test = f"by {gain.num_clusters} street networks" if gain.num_clusters else "paired t-test"
+    tested = f"{_interval_text(gain.interval)}, {p_text} ({test}), " if math.isfinite(gain.p_value) else ""
     return (
         f"<h2>{escape(_sentence(comparison.second))} against {escape(comparison.first)}, scenario by scenario</h2>"
         f'<div class="card comparison"><div><p class="verdict">{escape(comparison.verdict_text)}</p>'
-        f"<p>Mean difference in RMM {_format_signed(comparison)}, "
-        f"{tested if math.isfinite(comparison.p_value) else ''}"
-        f"{comparison.num_scenarios} scenarios.</p></div>{_difference_svg(comparison)}</div>"
+        f"<p>Mean difference in RMM {_format_signed(gain.difference)}, {tested}{gain.count} scenarios.</p></div>"
+        f"{_difference_svg(comparison)}</div>"
     )
 
 
 def _difference_svg(comparison: PairedComparison) -> str:
     """A dot per scenario, the mean and the interval below, zero dashed."""
     width, margin, base = 520, 24, 108
+    mean, interval = comparison.gain.difference, comparison.gain.interval
     # one dot per scenario, from left to right: `_stacked` needs them sorted
     dots = np.sort(np.asarray(comparison.differences, float))
     dots = dots[np.isfinite(dots)]
     # zero belongs to the axis even if all differences lie on one side
-    values = np.concatenate([dots, comparison.interval, [0.0, comparison.mean_difference]])
+    values = np.concatenate([dots, interval, [0.0, mean]])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low == high:
         low, high = low - 1, high + 1
@@ -330,10 +316,10 @@ def _difference_svg(comparison: PairedComparison) -> str:
         # dots that touch are stacked, up to the upper border
         y = 70 - min(height * 7, 62)
         shapes.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{color}" opacity=".65"/>')
-    if math.isfinite(comparison.interval[0]):  # no interval over a single scenario or street network
-        start, stop = (across(v) for v in comparison.interval)
+    if math.isfinite(interval[0]):  # no interval over a single scenario or street network
+        start, stop = (across(v) for v in interval)
         shapes.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
-    shapes.append(f'<circle cx="{across(comparison.mean_difference):.1f}" cy="91" r="6.5" fill="{tone}"/>')
+    shapes.append(f'<circle cx="{across(mean):.1f}" cy="91" r="6.5" fill="{tone}"/>')
     dots_label = "a dot per scenario, " if len(dots) else ""
     caption = f"{dots_label}mean and 95 % interval; {escape(comparison.second)} minus {escape(comparison.first)}"
     shapes.append(f'<text x="{width / 2}" y="{base + 38}" text-anchor="middle">{caption}</text>')

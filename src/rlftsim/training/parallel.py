@@ -51,12 +51,7 @@ class Fabric(Protocol):
 
     @property
     def global_rank(self) -> int:
-        """Position of this process among all, from 0."""
-        ...
-
-    @property
-    def is_global_zero(self) -> bool:
-        """True for the process of rank 0, which writes the files."""
+        """Position of this process among all, from 0, which writes the files."""
         ...
 
     def autocast(self) -> AbstractContextManager[Any]:

@@ -117,11 +117,6 @@ class LinkedProcess:
     links: Sequence[Connection]
     """Pipes to all other processes in rank 0, to rank 0 in the others."""
 
-    @property
-    def is_global_zero(self) -> bool:
-        """True for the process that forked all other processes."""
-        return self.global_rank == 0
-
     def all_reduce(self, data: Tensor, *, reduce_op: str) -> Tensor:
         """Sum of a tensor over all processes, the same bits in each process and in each run.
 
