@@ -14,7 +14,7 @@ from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.evaluate import EvaluateConfig
-from rlftsim.experiments.demo import DemoConfig, place_gain, run_demo
+from rlftsim.experiments.demo import place_gain, run_demo
 from rlftsim.experiments.model_specs import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.paper import qualitative, variance_scaling
 from rlftsim.experiments.results import Experiment, ExperimentResult, run_experiment
@@ -290,9 +290,9 @@ def test_mistakes_end_in_a_line(words, message, tmp_path, capsys):
 
 
 def test_the_demo_runs_the_same_stages(data, tmp_path):
-    result = run_demo(DemoConfig(TINY, data, QUICK, num_played=1, num_listed=1, is_quick=True), tmp_path)
-    page = result.report.read_text()
-    assert [e.name for e in result.evaluations] == ["base", "fine-tuned", "constant velocity", "oracle"]
+    evaluations = run_demo(TINY, data, QUICK, tmp_path, is_quick=True)
+    page = (tmp_path / "report.html").read_text()
+    assert [e.name for e in evaluations] == ["base", "fine-tuned", "constant velocity", "oracle"]
     assert "what a perfect simulator would score" in page
     assert "2 held-out scenarios, 4 rollouts each" in page
     assert page.count("Scenario c") + page.count("Scenario d") >= 1

@@ -3,12 +3,11 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
 
-from rlftsim.evaluation.compare import Comparison, compare, format_table
+from rlftsim.evaluation.compare import compare, format_table
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.evaluation.report import build_report, write_report
 from rlftsim.evaluation.results import Evaluation
@@ -39,38 +38,20 @@ PREDICTED_GAIN = 0.0168, 0.0346
 """RMM that the next run gains with 95 %, from ten runs: five seeds, two instruction sets (benchmarks/models.md)."""
 
 
-@dataclass(frozen=True)
-class DemoConfig:
-    """Recipe, data and size of the demo."""
-
-    recipe: Recipe
-    data: Path
-    """A data set with the split training, and that of the evaluation."""
-    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
-    num_played: int = 3
-    """Scenarios that play in the report."""
-    num_listed: int = 3
-    """Scenarios with films and pages: so many of the worst, and of the most changed."""
-    is_quick: bool = False
-    """The report says that its numbers mean nothing."""
-
-
-@dataclass(frozen=True)
-class DemoResult:
-    """Report and evaluations of the demo."""
-
-    report: Path
-    comparison: Comparison
-    evaluations: tuple[Evaluation, ...]
-    """Base, fine-tuned, constant velocity, oracle."""
-
-
-def run_demo(config: DemoConfig, out: Path) -> DemoResult:
+def run_demo(
+    recipe: Recipe, data: Path, evaluation: EvaluateConfig, out: Path, *, is_quick: bool = False
+) -> tuple[Evaluation, ...]:
     """Run the pipeline; stages that are finished are not repeated.
 
     Args:
-        config: Recipe, data and sizes; a folder of other settings is refused by the stage that made the folder.
+        recipe: Settings of model and training; a folder of other settings is refused by the stage that made the folder.
+        data: Data set with the split training, and that of the evaluation.
+        evaluation: Settings of the evaluations.
         out: Folder for runs, evaluations and the report `out/report.html`.
+        is_quick: True = fewer films and pages, and the report says that its numbers mean nothing.
+
+    Returns:
+        Evaluations of the base, the fine-tuned model, constant velocity and the oracle.
 
     Raises:
         RlftsimError: A stage failed; the message says which file and why.
@@ -85,10 +66,10 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         yield
         seconds[title] = time.perf_counter() - start
 
-    recipe, training, vocabulary = config.recipe, open_training(config.data), None
+    training, vocabulary = open_training(data), None
     if recipe.tokens is not None:
         with stage("vocabulary: motion and map tokens from the training scenarios"):
-            origin = f"demo on {config.data.name}, {recipe.tokens}"
+            origin = f"demo on {data.name}, {recipe.tokens}"
             vocabulary = find_vocabulary(training, recipe.tokens, out / "vocabulary.safetensors", origin=origin)
     with stage("pre-training: predict the next token of every agent"):
         policy = recipe.new_policy(vocabulary)
@@ -96,40 +77,40 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     with stage("fine-tuning: closed loop, MLOO reward, calibration at unchanged speed"):
         settings = (recipe.calibrate if recipe.method == "calibrate" else None) or recipe.finetune
         tuned = finetune_model(base, training, settings, out / "finetune")
-    with stage(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
+    with stage(f"evaluation: {evaluation.num_rollouts} rollouts of every held-out scenario"):
         # Both models from their folders, as `rlftsim evaluate` would load them.
         policies = {BASE: load_policy(str(base)), TUNED: load_policy(str(tuned))}
         rows = {**policies, FLOOR: load_policy("constant_velocity"), CEILING: "oracle"}
         evaluations = tuple(
-            evaluate(row, config.data, out / "evaluations", config.evaluate, name=name)  # type: ignore[arg-type]
+            evaluate(row, data, out / "evaluations", evaluation, name=name)  # type: ignore[arg-type]
             for name, row in rows.items()
         )
     with stage("report"):
         comparison = compare(evaluations[0], evaluations[1])
         difference = comparison["meta_metric"]
         # The title claims a gain only where the paired test finds one.
-        is_gain = difference.is_difference and difference.difference > 0 and not config.is_quick
+        is_gain = difference.is_difference and difference.difference > 0 and not is_quick
         frozen = {position: frozen_copy(policy) for position, policy in enumerate(policies.values())}
         durations = ", ".join(f"{title.partition(':')[0]} {time:.0f} s" for title, time in seconds.items())
         report = build_report(
-            EvaluatedModels(evaluations, frozen, ScenarioDataset(config.data, config.evaluate.split)),
+            EvaluatedModels(evaluations, frozen, ScenarioDataset(data, evaluation.split)),
             out,
             runs=(out / "finetune", out / "pretrain"),
-            num_listed=config.num_listed,
-            num_played=config.num_played,
-            jobs=config.evaluate.jobs,
+            num_listed=1 if is_quick else 3,
+            num_played=2 if is_quick else 3,
+            jobs=evaluation.jobs,
             title=f"RLFTSim demo: {CLAIM if is_gain else NO_CLAIM}",
-            summary=[*([QUICK_SUMMARY] if config.is_quick else []), SUMMARY],
+            summary=[*([QUICK_SUMMARY] if is_quick else []), SUMMARY],
             facts={
                 "time": f"{sum(seconds.values()) / 60:.1f} min ({durations})",
-                **({} if config.is_quick else {"expected gain": place_gain(difference.difference)}),
+                **({} if is_quick else {"expected gain": place_gain(difference.difference)}),
             },
         )
         write_report(out / "report.html", report)
         to_png(out / "picture.png", report.animations[0])
     print_wide(format_table(*evaluations))
     print_line(f"fine-tuned against base, {comparison.pairing}: {comparison['meta_metric'].verdict}")
-    return DemoResult(out / "report.html", comparison, evaluations)
+    return evaluations
 
 
 def place_gain(gain: float) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from rlftsim.evaluation.evaluate import EvaluateConfig
-from rlftsim.experiments.demo import DemoConfig, run_demo
+from rlftsim.experiments.demo import run_demo
 from rlftsim.jobs.progress import print_line
 from rlftsim.jobs.runner import usable_cores
 from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
@@ -36,14 +36,9 @@ def demo(
     jobs = min(usable_cores(), 4) if processes == "auto" else processes
     # All rollouts in one pass: so small a model takes a quarter less time with it.
     evaluation = EvaluateConfig(split="testing", rollouts_per_pass=32, jobs=jobs)
-    config = DemoConfig(
-        (recipe if seed is None else recipe.with_seed(seed)).with_processes(processes),
-        pack_path(),
-        replace(evaluation, num_rollouts=8, limit=8) if quick else evaluation,
-        num_played=2 if quick else 3,
-        num_listed=1 if quick else 3,
-        is_quick=quick,
-    )
+    evaluation = replace(evaluation, num_rollouts=8, limit=8) if quick else evaluation
+    recipe = (recipe if seed is None else recipe.with_seed(seed)).with_processes(processes)
     name = f"demo{'-quick' if quick else ''}{'' if seed is None else f'-seed-{seed}'}"
-    result = run_demo(config, out or Path("runs") / name)
-    print_line(f"report: {result.report}")
+    out = out or Path("runs") / name
+    run_demo(recipe, pack_path(), evaluation, out, is_quick=quick)
+    print_line(f"report: {out / 'report.html'}")
