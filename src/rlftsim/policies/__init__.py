@@ -2,6 +2,7 @@
 
 SHIPPED_POLICIES = {
     "smart": "rlftsim.policies.smart.policy:SmartPolicy",
+    "compact": "rlftsim.policies.smart.compact:CompactPolicy",
     "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
     "calibrated": "rlftsim.policies.calibrated.policy:CalibratedPolicy",
     "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",

@@ -557,6 +557,38 @@ class GcslConfig(ImitationConfig):
 
 
 @dataclass(frozen=True)
+class DistillConfig(ImitationConfig):
+    """Distillation: a student learns a teacher's distributions along rollouts."""
+
+    epochs: float = 5.0
+    batch_size: int = 2
+    micro_batch_size: int = 2
+    num_rollouts: int = 8
+    """Of each scenario in an update."""
+    teacher_share: float = 0.25
+    """Fraction of the updates along rollouts of the teacher, before the rest along the student's."""
+    learning_rate: float = 3e-3
+    final_lr_ratio: float = 0.0
+    warmup_updates: int = 20
+    gradient_clip: float = 1.0
+    label_smoothing: float = 0.0
+    context_radius_m: float | None = None
+    trained_radius_m: float = 1000.0
+    max_trained_agents: int | None = None
+    ema_decay: float | None = 0.99
+    checkpoint_every: int = 20
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(self, ("num_rollouts",))
+        _check_up_to_1(self, teacher_share="a fraction")
+        if self.label_smoothing or self.still_weight != 1.0 or self.validation.every:
+            raise ConfigError(
+                "label_smoothing, still_weight and validation have no effect on distillation: leave them out."
+            )
+
+
+@dataclass(frozen=True)
 class CalibrateConfig:
     """Calibration of a model with a vocabulary: a few named features on the token logits."""
 

@@ -11,6 +11,7 @@ SHIPPED = {
     "catk": "rlftsim.training.catk:CatkMethod",
     "road": "rlftsim.training.catk:RoadMethod",
     "gcsl": "rlftsim.training.goal_relabeling:GcslMethod",
+    "distill": "rlftsim.training.distill:DistillMethod",
     "calibrate": "rlftsim.training.calibrate:CalibrateMethod",
     "pretrain": "rlftsim.training.imitation:PretrainMethod",
 }

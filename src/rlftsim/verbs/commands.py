@@ -113,6 +113,11 @@ VERBS = {
         Command("finetune:finetune", ("recipe",), ("recipe", "out"), {"policy": "model", "scenarios": "data"},
             "print_model", FINETUNING, hidden=("on_update",)),
     ),
+    "distill": Verb(
+        "train a small, fast model to decide like a large one",
+        Command("distill:distill", ("policy",), ("out",), {"policy": "MODEL", "scenarios": "data"},
+            "print_student"),
+    ),
     "runs": Verb(
         "list training runs: how far they are, how good, and which settings differ",
         Command("runs:runs", ("folders",), show="print_runs"), starts_anew=True,

@@ -48,7 +48,7 @@ def load_start(policy: Any) -> tuple[Policy, Any]:
 
 
 def train(
-    policy: Policy,
+    policy: Any,
     scenarios: Scenarios,
     out: str | os.PathLike[str] | None,
     settings: Any,
@@ -60,7 +60,7 @@ def train(
     """The policy, trained in place and ready to simulate; the pictures of its run are drawn.
 
     Args:
-        policy: Policy to train.
+        policy: Policy to train, or a student with a teacher (`training.distill.Lesson`).
         scenarios: Training scenarios, with their futures.
         out: Folder of the run; None = a temporary one.
         settings: Settings of the method.
@@ -96,7 +96,7 @@ def train(
     if out is not None and "tensorboard" in trackers and is_first_process() and isinstance(policy, Policy):
         with suppress(RlftsimError, OSError):  # a picture is no reason to lose a model
             film_model(Path(out), policy, (options["held_out"] or scenarios)[0])
-    if out is not None:
+    if out is not None and isinstance(policy, Policy):
         remember_name(policy, out)
     return policy
 

@@ -149,3 +149,31 @@ def smart_demo() -> SmartConfig:
         max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8, dropout=0.0, history_drop=0.0,
         continuation_scores=True,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CompactConfig:
+    """Architecture of a compact policy."""
+
+    dim: int = 32
+    """Width of the features of a neighbor; the maximum over neighbors is half as wide again."""
+    hidden: int = 64
+    """Width of the features of an agent."""
+    map_radius_m: float = 25.0
+    """Radius within which map tokens are seen, around a point ahead of the agent."""
+    agent_radius_m: float = 60.0
+    """Radius within which agents are seen, likewise."""
+    max_map_neighbors: int = 6
+    """Map tokens that are seen at each of three points ahead."""
+    max_lights: int = 4
+    """Map tokens with a traffic light that are seen beside."""
+    max_agent_neighbors: int = 8
+    """Agents that are seen."""
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        sizes, radii = ("dim", "hidden"), ("map_radius_m", "agent_radius_m")
+        limits = ("max_map_neighbors", "max_lights", "max_agent_neighbors")
+        check_positive(self, (*sizes, *limits, *radii))
+        check_finiteness(self, radii)
+        check_limits(self, dict.fromkeys((*sizes, *limits), 65_536))

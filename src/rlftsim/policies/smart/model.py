@@ -6,16 +6,24 @@ A agents, B scenarios, N rollouts, D width, R selected elements, V tokens.
 import copy
 import math
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.policies.checkpoint import are_frozen_alike, load_network, load_strictly, read_model, save_model
+from rlftsim.policies.checkpoint import (
+    StoredModel,
+    are_frozen_alike,
+    load_network,
+    load_strictly,
+    read_model,
+    save_model,
+)
 from rlftsim.policies.distributions import (
     NEVER,
     CategoricalDistribution,
@@ -39,6 +47,39 @@ from rlftsim.tokens.vocabulary import Vocabulary
 VOCABULARY = "vocabulary.safetensors"
 
 Model = TypeVar("Model", bound="SmartModel")
+Made = TypeVar("Made")
+
+
+def save_token_model(folder: str | os.PathLike, policy: Any, config: Mapping[str, Any], card: str) -> None:
+    """Write config.json, model.safetensors, vocabulary.safetensors and README.md.
+
+    Args:
+        folder: Folder of the model, created where it is missing.
+        policy: Policy with a `network` and a vocabulary.
+        config: Settings that the policy is built with when loaded.
+        card: Text of README.md, in Markdown; empty = a line that names no origin.
+    """
+    extra = {VOCABULARY: policy.vocabulary.to("cpu").save}
+    save_model(folder, policy, config, card=card, weights=policy.network.state_dict(), extra=extra)
+
+
+def load_token_model(model: StoredModel, config_type: type[Any], make: Callable[..., Made]) -> Made:
+    """Policy of a folder as written by `save_token_model`, in training mode.
+
+    Args:
+        model: Stored settings and weights.
+        config_type: Dataclass of the settings.
+        make: Function of settings and vocabulary that builds the policy.
+
+    Raises:
+        ConfigError: The settings contradict each other.
+        CheckpointError: A missing or damaged file, or keys and shapes that do not fit.
+    """
+    config, weights, path = model.build(config_type), model.read_weights(), model.folder / VOCABULARY
+    if not path.exists():
+        raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
+    vocabulary = Vocabulary.load(path)
+    return load_network(lambda: make(config, vocabulary), weights, source=model.folder)
 
 
 class SmartModel(nn.Module):
@@ -179,8 +220,7 @@ class SmartModel(nn.Module):
             card: Text of README.md, in Markdown; empty = a line that names no origin.
         """
         config = asdict(self.config) | ({} if self.sampling.is_full else {"sampling": asdict(self.sampling)})
-        extra = {VOCABULARY: self.vocabulary.to("cpu").save}
-        save_model(folder, self, config, card=card, weights=self.network.state_dict(), extra=extra)
+        save_token_model(folder, self, config, card)
 
     @classmethod
     def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
@@ -193,12 +233,7 @@ class SmartModel(nn.Module):
         """
         model = read_model(folder, architecture=cls.architecture)
         sampling = model.pop("sampling", Sampling)
-        config, weights = model.build(SmartConfig), model.read_weights()
-        path = model.folder / VOCABULARY
-        if not path.exists():
-            raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
-        vocabulary = Vocabulary.load(path)
-        return load_network(lambda: cls(config, vocabulary, sampling), weights, source=model.folder)
+        return load_token_model(model, SmartConfig, partial(cls, sampling=sampling))
 
     # ---- parts of a forward pass ----------------------------------------------------------------------------------
 
