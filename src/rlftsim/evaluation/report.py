@@ -130,7 +130,6 @@ class Report:
     scenario_tables: Sequence[ScenarioTable] = ()
     chart_groups: Sequence[ChartGroup] = ()
     animations: Sequence[Animation] = ()
-    animations_note: str = ""
     facts: Mapping[str, str] = field(default_factory=dict)
     """Configuration, versions, durations, command, commit, ..."""
     footnotes: Sequence[str] = ()
@@ -159,9 +158,8 @@ def report_html(report: Report) -> str:
     ]
     # 2. Pictures of it, and of the runs behind it.
     if report.animations:
-        note = f'<p class="muted">{escape(report.animations_note)}</p>' if report.animations_note else ""
         players = "\n".join(animation_html(animation) for animation in report.animations)
-        sections.append(f"<h2>Scenarios in motion</h2>{note}{players}")
+        sections.append(f'<h2>Scenarios in motion</h2><p class="muted">{_WHO_MOVES}</p>{players}')
     sections += [_scenarios_html(table) for table in report.scenario_tables if table.rows]
     for group in report.chart_groups:
         caption = f'<p class="muted">{escape(group.caption)}</p>' if group.caption else ""
@@ -214,6 +212,7 @@ def _interval_text(interval: tuple[float, float]) -> str:
 
 
 _ERRORS = "Mean ± standard error over scenarios; point at a number for its 95 % interval."
+_WHO_MOVES = "The model moves every agent, the ego included; the first 1.1 s are logged."
 _ARROWS_MEAN = "↑ higher is better, ↓ lower is better."
 _DRIFT_MEANS = (
     "The meta-metric rewards slow traffic, which hits nothing and stays on the road; here slowness shows. Numbers "
@@ -382,7 +381,7 @@ def build_report(
     """
     first, *others = models.evaluations
     judged = others[0] if others else first
-    comparisons = [compare(first, other) for other in others if other.provenance.policy != "oracle"]
+    compared = [compare(first, other) for other in others if other.provenance.policy != "oracle"]
     rows = rank_scenarios(models.evaluations)
     changed = sorted((row for row in rows if np.isfinite(row.change)), key=lambda row: -abs(row.change))
     changed = changed[:num_listed] if others else []
@@ -395,6 +394,7 @@ def build_report(
         [replace(row, **files.get(row.scenario_id, {})) for row in selected] for selected in (rows[:MAX_ROWS], changed)
     )
     names = [evaluation.name for evaluation in models.evaluations]
+    most_lost = f"Scenarios, those in which {judged.name} loses most first"
     environment = describe_environment()
     return Report(
         title=title or f"{judged.name} against {first.name}" if others else title or first.name,
@@ -412,21 +412,11 @@ def build_report(
             f"{len(first)} held-out scenarios, {first.config.num_rollouts} rollouts each, metric "
             f"{first.config.metric}. {first.data_note}"
         ).rstrip(),
-        comparisons=[PairedComparison.of(comparison) for comparison in comparisons],
+        comparisons=list(map(PairedComparison.of, compared)),
         animations=animations,
-        animations_note="The model moves every agent, the ego included; the first 1.1 s are logged.",
         scenario_tables=[
-            ScenarioTable(
-                f"Most changed scenarios, {judged.name} against {first.name}",
-                names,
-                changed,
-            ),
-            ScenarioTable(
-                f"Scenarios, those in which {judged.name} loses most first",
-                names,
-                listed,
-                _describe_index(models, rows),
-            ),
+            ScenarioTable(f"Most changed scenarios, {judged.name} against {first.name}", names, changed),
+            ScenarioTable(most_lost, names, listed, _describe_index(models, rows)),
         ],
         chart_groups=[_chart_run(run) for run in runs],
         facts={
