@@ -149,7 +149,7 @@ def _happens(chain: FailureChain, dice: Sequence[int], imposed: Float[np.ndarray
 def format_study(study: Study) -> Table:
     """Table of the scenarios, the most probable event first, for `print_wide`."""
     event = study.config.event.replace("_", " ")
-    table = Table(*HEADINGS, title=f"{event} of {study.config.planner} within 8 s", title_justify="left")
+    table = Table(*HEADINGS, title=f"{event} of {study.config.planner} within 8 s")
     for row in study_rows(study):
         table.add_row(*row)
     return table

@@ -269,7 +269,7 @@ def format_table(*evaluations: Evaluation) -> Table:
     Args:
         evaluations: Evaluations in the order of the columns; `select_columns` chooses the rows.
     """
-    table = Table(caption=describe_data(*evaluations) or None, caption_justify="left")
+    table = Table(caption=describe_data(*evaluations) or None)
     table.add_column("", no_wrap=True)
     for evaluation in evaluations:
         table.add_column(evaluation.name, justify="right")
@@ -318,8 +318,6 @@ def comparison_table(name_a: str, name_b: str, alpha: float) -> Table:
         collapse_padding=True,
         show_edge=False,
         pad_edge=False,
-        title_justify="left",
-        caption_justify="left",
     )
     table.add_column("", no_wrap=True)
     for name in (name_a, name_b, "change", f"{100 - 100 * alpha:g} %", "to", "p"):

@@ -198,8 +198,6 @@ def build_outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
         *headings,
         title="goals: within 2 m in the end (reached), at any time (passed)",
         caption="closest: smallest distance to the goal, in the best rollout and in the median one",
-        title_justify="left",
-        caption_justify="left",
     )
     for entry, o in outcomes:
         numbers = (f"{o.reached:.0%}", f"{o.passed:.0%}", f"{o.best_m:.1f}", f"{o.median_m:.1f}")

@@ -154,7 +154,7 @@ def format_scores(evaluation: Evaluation) -> Table:
     """Every mean ± standard error with the metric's version; arrows show the better direction."""
     metric = metric_by_name(evaluation.config.metric)
     title = f"{evaluation.name}: {len(evaluation)} scenarios, {evaluation.config.num_rollouts} rollouts each"
-    table = Table(title=title, title_justify="left", caption=evaluation.data_note or None, caption_justify="left")
+    table = Table(title=title, caption=evaluation.data_note or None)
     for heading in ("", "mean", "standard error", "scenarios", "metric"):
         table.add_column(heading, justify="left" if heading in ("", "metric") else "right", no_wrap=True)
     # all columns by their stored names, other than in tables of policies: the place to look a single score up

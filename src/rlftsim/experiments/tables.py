@@ -123,7 +123,7 @@ class TextTable:
 
     def for_terminal(self) -> Table:
         """The table for `print_wide`."""
-        table = Table(title=self.title, caption=self.note or None, title_justify="left", caption_justify="left")
+        table = Table(title=self.title, caption=self.note or None)
         for i, heading in enumerate(self.headings):
             table.add_column(heading, justify="right" if i else "left", no_wrap=not i)
         for cells in self.rows:

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -83,17 +83,18 @@ def print_lines(text: str) -> None:
     print(_printable_lines(text))
 
 
-def print_wide(*tables: object) -> None:
+def print_wide(*tables: Table) -> None:
     """Print tables as wide as the terminal or as COLUMNS says, else `FILE_WIDTH` wide in files. Nothing is cut: what
     has no room goes on in the next line. Brackets in texts are not markup."""
     width = None if Console().is_terminal or "COLUMNS" in os.environ else FILE_WIDTH
     console = _PlainConsole(width=width, markup=False, emoji=False)
     for table in tables:
-        for column in table.columns if isinstance(table, Table) else ():
+        table.title_justify = table.caption_justify = "left"
+        for column in table.columns:
             column.overflow = "fold"
             # a label that may not be broken would be cut where it does not fit beside the numbers
             unlimited = console.options.update(max_width=10**6)
-            column.no_wrap &= Measurement.get(console, unlimited, cast(Table, table)).minimum <= console.width
+            column.no_wrap &= Measurement.get(console, unlimited, table).minimum <= console.width
         console.print(table)
 
 

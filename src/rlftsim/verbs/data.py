@@ -40,7 +40,7 @@ def stats(data: str, *, split: str | None = None) -> None:
         split: Split to count; left out, all of them.
     """
     _check_local(data)
-    table = Table(title=data, show_header=False, title_justify="left")
+    table = Table(title=data, show_header=False)
     for label, value in _stats_rows(dataset_stats(dataset_folder(data), split=split)).items():
         table.add_row(label, value)
     print_wide(table)

@@ -155,7 +155,7 @@ def print_evaluation(result: Evaluation | WindowEvaluation, *, out: Path) -> Non
     """
     if isinstance(result, WindowEvaluation):
         for title, columns in TABLES.items():
-            table = Table(*(HEADINGS[column] for column in columns), title=title, title_justify="left")
+            table = Table(*(HEADINGS[column] for column in columns), title=title)
             for row in result.rows():
                 table.add_row(*(row[column] for column in columns))
             print_wide(table)

@@ -252,7 +252,7 @@ def training_table(command: TrainingCommand, forecast: TrainingForecast) -> Tabl
     table = Table(
         title=f"{command.verb} {command.recipe} on this machine, {forecast.processes} processes",
         caption="without validations and the start; a GPU's own memory is not measured",
-        show_header=False, title_justify="left", caption_justify="left",
+        show_header=False,
     )  # fmt: skip
     table.add_row("updates", str(forecast.num_updates))
     if math.isnan(forecast.seconds):

@@ -63,7 +63,7 @@ def propose_goals(
         check_membership(scenarios, scenario_id, data, "--scenario")
         logged = scenarios.by_id(scenario_id)
         headings = ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]")
-        table = Table(*headings, title=f"scenario {scenario_id}", title_justify="left")
+        table = Table(*headings, title=f"scenario {scenario_id}")
         for track in _find_tracks(logged, agent):
             proposals = propose(logged, track)
             goal = next((proposal for proposal in proposals if _is_choice(proposal, choose)), None)

@@ -106,7 +106,7 @@ def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: 
         *(Column(heading, justify="right") for heading in ("machines", "cores", "time", "price")),
         title=f"{plan}: {total} scenarios of {cost.seconds:.3g} s ({cost.num_measured} measured here{agents})",
         caption=f"at ${price:g} for a core and hour; without reading over a network and starting machines{memory}",
-        title_justify="left", caption_justify="left", min_width=76,  # title and caption wrap at the table's width
+        min_width=76,  # title and caption wrap at the table's width
     )  # fmt: skip
     for machines, num_cores in dict.fromkeys([(1, 1), (1, cores), (nodes, cores)]):
         # until the last core is done, where each takes one piece of the work after another

@@ -98,7 +98,7 @@ def tokens(
     write_vocabulary_report(folder, classes, vocabulary=source.name, data=f"{compared} scenarios of {data}, {split}")
     # 3. the same numbers as in the report, on the terminal
     columns = (Column(coverage.class_name, justify="right") for coverage in classes)
-    table = Table("", *columns, title="How well the tokens cover the data", title_justify="left")
+    table = Table("", *columns, title="How well the tokens cover the data")
     for name, words in ROWS.items():
         table.add_row(name, *(words(coverage) for coverage in classes))
     print_wide(table)
