@@ -13,6 +13,7 @@ from statistics import fmean
 import torch
 
 from rlftsim.jobs.progress import progress_bar
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
@@ -45,8 +46,9 @@ def main() -> None:
         learning_rate=arguments.learning_rate,
     )
     fabric = start_fabric(DeviceConfig(accelerator="cpu", processes=1))
-    calibrated = load_policy(arguments.model)
-    learner = prepare(load_policy(arguments.model).base, config, fabric.device)
+    trained, calibrated = (load_policy(arguments.model) for _ in range(2))
+    assert isinstance(trained, CalibratedPolicy) and isinstance(calibrated, CalibratedPolicy)
+    learner = prepare(trained.base, config, fabric.device)
     learner.reference = calibrated.requires_grad_(False)
     order = torch.Generator().manual_seed(0)
     index: list[int] = []
@@ -64,7 +66,6 @@ def main() -> None:
         print(
             f"KL of pass {start // per_pass + 1}: {fmean(divergence[start : start + per_pass]):.4f} nats per decision"
         )
-    learner.finish()
     learner.result.eval().save_pretrained(arguments.out)
 
 
