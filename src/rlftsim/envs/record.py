@@ -95,11 +95,12 @@ def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
     is_present, is_observed = (
         array[CURRENT_STEP:, scene_row, :count].T for array in find_presence(episode.world, state.world)
     )
+    motion, z = (values[:, scene_row, :count] for values in state.world.since_start)
     return Record(
         scene=replace(scene, lights=find_lights(episode.world, state.world)[scene_row]),
         agent=agent,
-        motion=np.stack([step[scene_row, :count] for step in state.world.track[CURRENT_STEP:]], 1),
-        z=np.stack([z[scene_row, :count] for z in state.world.z[CURRENT_STEP:]], 1),
+        motion=np.ascontiguousarray(motion.swapaxes(0, 1)),
+        z=np.ascontiguousarray(z.T),
         is_present=is_present,
         is_observed=is_observed,
         collisions=state.collisions[row],

@@ -164,6 +164,11 @@ class WorldState:
         """Present motion."""
         return self.track[-1]
 
+    @cached_property
+    def since_start(self) -> tuple[Float[np.ndarray, "T1 B A 5"], Float[np.ndarray, "T1 B A"]]:
+        """Motion and heights from the current step of the log to the present one."""
+        return np.stack(self.track[CURRENT_STEP:]), np.stack(self.z[CURRENT_STEP:])
+
 
 def build_world(
     scenarios: Sequence[Scenario],
