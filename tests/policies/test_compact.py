@@ -46,7 +46,7 @@ def test_a_calibrated_compact_policy_keeps_the_contract(vocabulary):
 def test_a_student_of_512_tokens_has_at_most_65_000_weights(vocabulary):
     policy = compact(vocabulary, CompactConfig())
     spare = 512 - vocabulary.num_tokens
-    assert sum(w.numel() for w in policy.parameters()) + spare * (policy.network.head.in_features + 1) == 62_880
+    assert sum(w.numel() for w in policy.parameters()) + spare * (policy.network.head.in_features + 1) == 63_200
 
 
 def test_a_compact_policy_is_read_back_as_it_was_written(vocabulary, tmp_path):
@@ -103,3 +103,12 @@ def test_no_agent_without_a_map_or_alone_is_left_without_a_decision(vocabulary):
 def test_sizes_that_make_no_sense_are_refused(changes):
     with pytest.raises(ConfigError, match=next(iter(changes))):
         CompactConfig(**changes)
+
+
+def test_a_scene_that_is_made_again_by_other_weights_is_that_of_these_weights(vocabulary):
+    policy, other = compact(vocabulary).eval(), compact(vocabulary, seed=1).eval()
+    batch = collate(SCENES)
+    with torch.no_grad():
+        again, fresh = other.encode_again(batch, policy.encode(batch)), other.encode(batch)
+        first, second = (other.decide(c, other.begin(c, 2, None, torch.empty(0))).logits for c in (again, fresh))
+    assert torch.equal(first, second)

@@ -1,7 +1,5 @@
 """A student comes nearer to its teacher, along the rollouts of both."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -15,14 +13,13 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.compact import CompactPolicy
 from rlftsim.policies.smart.config import CompactConfig
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.rows import find_rows
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.agent_tokens import corner_distances
 from rlftsim.tokens.subset import SharedTokens, choose_tokens
 from rlftsim.tokens.vocabulary import class_of_type
 from rlftsim.training.config import CalibrateConfig, DistillConfig
-from rlftsim.training.distill import Lesson, roll_out
+from rlftsim.training.distill import Lesson, judge, roll_out
 from rlftsim.training.run import train_policy
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.verbs.distill import distill
@@ -48,27 +45,24 @@ def student(vocabulary, drawn_scenarios):
 
 
 def settings(**changes):
-    values = {"epochs": 3.0, "num_rollouts": 2, "learning_rate": 1e-2, "warmup_updates": 0, "ema_decay": None}
+    values = {"epochs": 3.0, "num_rollouts": 2, "steps_per_update": 2, "learning_rate": 1e-2, "ema_decay": None}
     return DistillConfig(checkpoint_every=2, device=tiny.CPU, **values | changes)
 
 
+@torch.no_grad()
 def divergence(policy, teacher, scenarios):
     """Mean KL to the teacher along the policy's own rollouts, nats."""
-    policy, teacher, batch = policy.eval(), load_policy(teacher), collate(scenarios)
-    tokens = SharedTokens.find(policy.vocabulary, teacher.vocabulary)
-    with torch.no_grad():
-        rollouts = roll_out(policy, None, batch, tokens, DistillConfig(num_rollouts=4), 7)
-        class_id = class_of_type(batch.object_type)[:, None, :, None].expand(rollouts.decision.shape)
-        taught = replace(rollouts, decision=tokens.in_large[class_id, rollouts.decision])
-        said = teacher.score(teacher.encode(batch), taught)
-        target = tokens.project(said.log_probs.exp(), class_id[find_rows(said.mask, is_dense=False)])
-        log_probs = policy.score(policy.encode(batch), rollouts).log_probs
+    lesson, batch = Lesson(policy.eval(), load_policy(teacher)), collate(scenarios)
+    context = policy.encode(batch)
+    rollouts = roll_out(lesson, batch, context, DistillConfig(num_rollouts=4), 7, is_taught=False)
+    target, _ = judge(lesson, batch, rollouts)
+    log_probs = policy.score(context, rollouts).log_probs
     return float(torch.nn.functional.kl_div(log_probs, target, reduction="none").sum(-1).mean())
 
 
 def test_a_student_ends_nearer_to_the_teacher_than_it_began(teacher, student, drawn_scenarios, tmp_path):
     before = divergence(student, teacher, drawn_scenarios)
-    train_policy(Lesson(student, load_policy(teacher)), drawn_scenarios, tmp_path, settings(epochs=6.0))
+    train_policy(Lesson(student, load_policy(teacher)), drawn_scenarios, tmp_path, settings(epochs=4.0))
     after = divergence(student, teacher, drawn_scenarios)
     assert after < 0.5 * before  # measured 1.1 -> 0.1
     metrics = read_metrics(tmp_path)
@@ -92,10 +86,10 @@ def test_a_run_that_was_stopped_ends_as_if_it_never_was(first, teacher, student,
 
 @pytest.mark.parametrize("is_taught", [True, False])
 def test_student_and_teacher_agree_on_every_state(is_taught, teacher, student, drawn_scenarios):
-    loaded, batch = load_policy(teacher), collate(drawn_scenarios)
-    tokens = SharedTokens.find(student.vocabulary, loaded.vocabulary)
+    lesson, batch = Lesson(student.eval(), load_policy(teacher)), collate(drawn_scenarios)
+    loaded, tokens = lesson.teacher, lesson.tokens
     with torch.no_grad():
-        rollouts = roll_out(student.eval(), loaded if is_taught else None, batch, tokens, settings(), 3)
+        rollouts = roll_out(lesson, batch, student.encode(batch), settings(), 3, is_taught=is_taught)
     class_id = class_of_type(batch.object_type)[:, None].expand(rollouts.heading.shape[:3])
     present = batch.agent_mask[:, None].expand(class_id.shape)
     for policy, ids in ((loaded, tokens.in_large), (student, torch.arange(NUM_TOKENS).expand(3, -1))):
@@ -151,8 +145,8 @@ def test_mistakes_are_one_clear_line(teacher, student, drawn_scenarios, tmp_path
     foreign = tiny.small_vocabulary([scenes.crowd(num_agents=12)])
     with pytest.raises(ConfigError, match="tokens that the teacher lacks"):
         Lesson(CompactPolicy(student.config, foreign), load_policy(teacher))
-    with pytest.raises(ConfigError, match="have no effect on distillation"):
-        settings(label_smoothing=0.1)
+    with pytest.raises(ConfigError, match="teacher_share"):
+        settings(teacher_share=2.0)
 
 
 def test_a_folder_of_another_teacher_is_refused(teacher, student, vocabulary, drawn_scenarios, tmp_path):

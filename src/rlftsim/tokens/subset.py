@@ -47,15 +47,38 @@ class SharedTokens:
                 raise ConfigError("the student has tokens that the teacher lacks: make one by `rlftsim distill`.")
         return cls(torch.stack(in_large), torch.stack(in_small))
 
-    def project(self, probability: Float[Tensor, "R W"], class_id: Int64[Tensor, "R"]) -> Float[Tensor, "R V"]:
+    def to_large(self, token_id: Int64[Tensor, "B N A *L"], object_type: Int64[Tensor, "B A"]) -> Tensor:
+        """Ids in the large vocabulary of tokens of the small one.
+
+        Args:
+            token_id: Ids of tokens of the small vocabulary, each within the class of the agent, of N rollouts.
+            object_type: Object type of each agent, which decides the class.
+        """
+        return self.in_large[_spread(class_of_type(object_type), token_id), token_id]
+
+    def to_small(self, token_id: Int64[Tensor, "B N A *L"], object_type: Int64[Tensor, "B A"]) -> Tensor:
+        """Ids of the tokens of the small vocabulary that are nearest to tokens of the large one.
+
+        Args:
+            token_id: Ids of tokens of the large vocabulary, each within the class of the agent, of N rollouts.
+            object_type: Object type of each agent, which decides the class.
+        """
+        return self.in_small[_spread(class_of_type(object_type), token_id), token_id]
+
+    def project(self, probability: Float[Tensor, "R W"], object_type: Int64[Tensor, "R"]) -> Float[Tensor, "R V"]:
         """Probabilities of the small vocabulary's tokens: each token of the large one counts for the nearest.
 
         Args:
             probability: Probabilities of R elements over the tokens of the large vocabulary.
-            class_id: Class of each element.
+            object_type: Object type of the agent of each element, which decides the class of the tokens.
         """
         projected = probability.new_zeros(len(probability), self.in_large.shape[1])
-        return projected.scatter_add_(1, self.in_small[class_id], probability)
+        return projected.scatter_add_(1, self.in_small[class_of_type(object_type)], probability)
+
+
+def _spread(class_id: Int64[Tensor, "B A"], token_id: Int64[Tensor, "B N A *L"]) -> Tensor:
+    """Classes in the shape of tokens."""
+    return class_id.view(len(class_id), 1, -1, *[1] * (token_id.dim() - 3)).expand(token_id.shape)
 
 
 def choose_tokens(vocabulary: Vocabulary, scenarios: Scenarios, num_tokens: int) -> Vocabulary:
@@ -63,8 +86,8 @@ def choose_tokens(vocabulary: Vocabulary, scenarios: Scenarios, num_tokens: int)
 
     Args:
         vocabulary: Large vocabulary; of a class with fewer tokens all are kept.
-        scenarios: Training scenarios, whose tokens are counted.
-        num_tokens: Number of tokens of each class, at least 1.
+        scenarios: Training scenarios, at least one; the tokens of all logged tracks are counted.
+        num_tokens: Number of tokens of each class, at least 1: that which stands still is always there.
     """
     counts = torch.zeros(vocabulary.token_mask.shape, dtype=torch.float64)
     for index in range(len(scenarios)):

@@ -557,35 +557,59 @@ class GcslConfig(ImitationConfig):
 
 
 @dataclass(frozen=True)
-class DistillConfig(ImitationConfig):
+class DistillConfig:
     """Distillation: a student learns a teacher's distributions along rollouts."""
 
     epochs: float = 5.0
+    """Passes over the training scenarios."""
     batch_size: int = 2
-    micro_batch_size: int = 2
+    """Scenarios per update, over all processes."""
     num_rollouts: int = 8
     """Of each scenario in an update."""
+    steps_per_update: int = 8
+    """Optimizer steps of an update, each on a share of the rollouts that the teacher has judged."""
     teacher_share: float = 0.25
     """Fraction of the updates along rollouts of the teacher, before the rest along the student's."""
     learning_rate: float = 3e-3
+    """At its highest, after the warm-up."""
     final_lr_ratio: float = 0.0
-    warmup_updates: int = 20
+    """The learning rate falls along a cosine to this fraction of it."""
+    warmup_updates: int = 5
+    """Updates over which the learning rate rises linearly."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Decay rates of Adam's moments."""
+    weight_decay: float = 0.01
+    """Decoupled, as in AdamW."""
     gradient_clip: float = 1.0
-    label_smoothing: float = 0.0
-    context_radius_m: float | None = None
-    trained_radius_m: float = 1000.0
-    max_trained_agents: int | None = None
-    ema_decay: float | None = 0.99
+    """Largest norm of the gradient."""
+    ema_decay: float | None = 0.9
+    """Save a moving average of the weights, of which this fraction is kept at each update. None = the weights."""
+    max_skipped_in_a_row: int = 5
+    """An update whose gradient is not finite is skipped; after so many in a row the run stops."""
     checkpoint_every: int = 20
+    """Updates."""
+    seed: int = 0
+    """Of everything that is random in the run."""
+    device: DeviceConfig = field(default_factory=DeviceConfig)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self, ("num_rollouts",))
-        _check_up_to_1(self, teacher_share="a fraction")
-        if self.label_smoothing or self.still_weight != 1.0 or self.validation.every:
-            raise ConfigError(
-                "label_smoothing, still_weight and validation have no effect on distillation: leave them out."
-            )
+        check_types(self)
+        sizes = ("batch_size", "num_rollouts", "steps_per_update", "checkpoint_every", "max_skipped_in_a_row")
+        check_positive(self, ("epochs", "learning_rate", "gradient_clip", *sizes))
+        check_not_negative(self, ("warmup_updates", "weight_decay"))
+        check_finiteness(self, ("epochs", "learning_rate", "weight_decay"))
+        _check_betas(self.betas)
+        _check_decay(self.ema_decay)
+        _check_up_to_1(self, teacher_share="a fraction", final_lr_ratio="a fraction")
+
+    @property
+    def micro_batch_size(self) -> int:
+        """All scenarios of an update: students are small."""
+        return self.batch_size
+
+    def num_updates(self, num_scenarios: int) -> int:
+        """Updates of the run."""
+        return max(math.ceil(self.epochs * num_scenarios / self.batch_size), 1)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
 from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary, class_of_type
-from rlftsim.training.config import ImitationConfig, PretrainConfig
+from rlftsim.training.config import DistillConfig, ImitationConfig, PretrainConfig
 from rlftsim.training.data import trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
@@ -121,7 +121,7 @@ class PretrainMethod(ImitationMethod[PretrainConfig]):
         return loss_along_log(learner.policy, batch, trained, learner.update)
 
 
-def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
+def learning_rate(update: int, total: int, config: ImitationConfig | DistillConfig) -> float:
     """Learning rate of an update: linear warm-up, then a cosine down to `final_lr_ratio` of the highest.
 
     Args:

@@ -41,7 +41,7 @@ def distill(
             scenarios with their logged futures.
         out: Folder of the run: configuration, metrics, checkpoints, model. A finished run is not repeated. In Python
             left out, no file is kept.
-        size: Size of the student. small: 62,880 weights, 512 of the teacher's tokens of each class.
+        size: Size of the student. small: 63,200 weights, 512 of the teacher's tokens of each class.
         epochs: Passes over the training scenarios; left out, 5.
         processes: Processes that train; left out, as many as the machine has cores for.
         limit: Number of training scenarios, from the first on; left out, all.

@@ -90,6 +90,17 @@ class CompactPolicy(nn.Module):
         scene = self.network.build_scene(scenarios, self.vocabulary)
         return Context(scene, current, scenarios.object_type, scenarios.agent_mask)
 
+    def encode_again(self, scenarios: ScenarioBatch, context: Context) -> Context:
+        """`encode(scenarios)`, with map tokens and history of a context that the policy made before its last update.
+
+        Args:
+            scenarios: Scenarios that `context` was encoded from, in the same order.
+            context: Context of this policy, by earlier weights.
+        """
+        if not isinstance(context, Context):
+            return self.encode(scenarios)
+        return replace(context, scene=self.network.build_scene(scenarios, self.vocabulary, context.scene))
+
     def relight(self, context: Context, scenarios: ScenarioBatch) -> Context:
         """The context with other traffic lights.
 
@@ -167,10 +178,10 @@ class CompactPolicy(nn.Module):
         """A student with fresh weights, and the tokens of a teacher that the scenarios need most.
 
         Args:
-            size: Size of the student, of `STUDENTS`.
-            vocabulary: Vocabulary of the teacher.
-            scenarios: Training scenarios, whose motions are counted.
-            seed: Seed of the weights.
+            size: Size of the student, a name of `STUDENTS`.
+            vocabulary: Vocabulary of the teacher, whose map prototypes are taken over.
+            scenarios: Training scenarios, at least one, whose logged motions are counted.
+            seed: Seed of the weights, at least 0, for the random numbers of torch.
         """
         config, num_tokens = STUDENTS[size]
         tokens = choose_tokens(vocabulary, scenarios, num_tokens)

@@ -9,7 +9,6 @@ simulation), K neighbors, C classes, V motion tokens, D width of a neighbor, H w
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -32,13 +31,13 @@ LIGHT_POINT = 1
 """Index of the map point whose nearest tokens with a light are seen."""
 ANTICIPATION_S = 1.0
 """Agents are the nearest to the place that is reached after so long."""
-FAR_M, NEAR_M, FAST_MPS = 20.0, 4.0, 10.0
-"""Units of distances and speeds; the finer unit of distance is also where the finer number ends."""
+FAR_M, NEAR_M, CLOSE_M, SMALL_RAD, FAST_MPS = 20.0, 4.0, 1.0, 0.2, 10.0
+"""Units of distances, angles and speeds. Numbers in a finer unit end at 1: there the coarser unit says enough."""
 CELL_M, NUM_CANDIDATES = 6.0, 48
 """Side of a cell of the map, and the tokens nearest to the middle among which those nearest to a point are."""
 MAX_CELLS, CELLS_PER_BLOCK = 1024, 1024
 """Most cells along an axis, which maps of 6 km have, and cells whose distances are computed together."""
-NUM_RELATIONS = 10
+NUM_RELATIONS = 15
 """Numbers of a relation to a neighbor, without velocity."""
 
 
@@ -189,14 +188,15 @@ class CompactNetwork(nn.Module):
 
     # ---- once per scenario ------------------------------------------------------------------------------------------
 
-    def build_scene(self, scenarios: ScenarioBatch, vocabulary: Vocabulary) -> Scene:
+    def build_scene(self, scenarios: ScenarioBatch, vocabulary: Vocabulary, like: Scene | None = None) -> Scene:
         """Features of map tokens and agents, and tables of the motion tokens.
 
         Args:
             scenarios: Scenarios with maps and agents, map frame.
             vocabulary: Motion tokens of the agents, and prototypes of map tokens.
+            like: Scene of the same scenarios by other weights, whose map tokens and grids are taken over; None = new.
         """
-        tokens = tokenize_map(scenarios, vocabulary.map_prototypes)
+        tokens = tokenize_map(scenarios, vocabulary.map_prototypes) if like is None else like.tokens
         class_id = class_of_type(scenarios.object_type)
         one_hot = functional.one_hot(class_id, len(CLASS_NAMES)).to(scenarios.size.dtype)
         agents = torch.cat([scenarios.size / NEAR_M, one_hot], -1)
@@ -207,8 +207,11 @@ class CompactNetwork(nn.Module):
         return Scene(
             tokens=tokens,
             class_id=torch.where(scenarios.agent_mask, class_id, PADDING_CLASS),
-            grid=TokenGrid.build(tokens.position, tokens.token_mask, self.config.map_radius_m),
-            **self._embed_map(tokens, vocabulary),
+            grid=TokenGrid.build(tokens.position, tokens.token_mask, self.config.map_radius_m)
+            if like is None
+            else like.grid,
+            lights=self._find_lights(tokens) if like is None else like.lights,
+            map_sources=self._embed_map(tokens, vocabulary),
             agent_sources=self.agent_source(agents).flatten(0, 1),
             agents=self.agent(agents),
             last=self.last_token(motion),
@@ -231,16 +234,18 @@ class CompactNetwork(nn.Module):
         if torch.equal(light, scene.tokens.light):
             return scene
         tokens = replace(scene.tokens, light=light)
-        return replace(scene, tokens=tokens, **self._embed_map(tokens, vocabulary))
+        sources = self._embed_map(tokens, vocabulary)
+        return replace(scene, tokens=tokens, lights=self._find_lights(tokens), map_sources=sources)
 
-    def _embed_map(self, tokens: MapTokens, vocabulary: Vocabulary) -> dict[str, Any]:
-        """The fields of a scene that depend on traffic lights."""
+    def _find_lights(self, tokens: MapTokens) -> TokenGrid | None:
+        has_light = tokens.light > 0
+        return TokenGrid.build(tokens.position, has_light, self.config.map_radius_m) if has_light.any() else None
+
+    def _embed_map(self, tokens: MapTokens, vocabulary: Vocabulary) -> Float[Tensor, "BP D"]:
         ends = vocabulary.map_prototypes[:, -1][tokens.token_id] / NEAR_M  # [B, P, 2]
         labels = ((tokens.type, NUM_TYPES), (tokens.family, NUM_FAMILIES), (tokens.light, NUM_LIGHTS))
         one_hot = [functional.one_hot(values, count).to(ends.dtype) for values, count in labels]
-        has_light = tokens.light > 0
-        grid = TokenGrid.build(tokens.position, has_light, self.config.map_radius_m) if has_light.any() else None
-        return {"map_sources": self.map_source(torch.cat([ends, *one_hot], -1)).flatten(0, 1), "lights": grid}
+        return self.map_source(torch.cat([ends, *one_hot], -1)).flatten(0, 1)
 
     # ---- at every decision ------------------------------------------------------------------------------------------
 
@@ -333,4 +338,5 @@ def relate(row: Poses, neighbor: Poses) -> tuple[Float[Tensor, "R K n"], Float[T
     (x, y), (cos, sin) = offset.unbind(-1), direction.unbind(-1)
     # where the neighbor is for the row, and where the row is for the neighbor
     numbers = torch.stack([x, y, -x * cos - y * sin, x * sin - y * cos], -1)
-    return torch.cat([numbers / FAR_M, numbers.clamp(-NEAR_M, NEAR_M) / NEAR_M, direction], -1), direction
+    scaled = [numbers / FAR_M, *((numbers / unit).clamp(-1, 1) for unit in (NEAR_M, CLOSE_M))]
+    return torch.cat([*scaled, direction, (sin / SMALL_RAD).clamp(-1, 1)[..., None]], -1), direction
