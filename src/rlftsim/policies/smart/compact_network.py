@@ -86,7 +86,7 @@ class TokenGrid:
             cells = (middle + offset).split(CELLS_PER_BLOCK)
             squared = ((tokens[:, 0] - c[:, :1]).square_().add_((tokens[:, 1] - c[:, 1:]).square_()) for c in cells)
             count = min(NUM_CANDIDATES, mask.shape[1])
-            nearest += [block.topk(count, largest=False).indices + start for block in squared]
+            nearest += [block.topk(count, largest=False, sorted=False).indices + start for block in squared]
         return cls(inside.flatten(0, 1), torch.cat(nearest), corner, (size[0], size[1]), radius_m)
 
     def find_nearest(
@@ -105,7 +105,7 @@ class TokenGrid:
         cell = (scenario[:, None] * size[0] + cell[..., 0]) * size[1] + cell[..., 1]
         candidates = self.candidates.index_select(0, cell.flatten())  # [R n, c]
         offset = functional.embedding(candidates, self.position) - points.flatten(0, 1)[:, None]
-        squared, column = offset.square().sum(-1).topk(min(limit, candidates.shape[1]), largest=False)
+        squared, column = offset.square().sum(-1).topk(min(limit, candidates.shape[1]), largest=False, sorted=False)
         index, mask = candidates.gather(1, column), squared < self.radius_m**2
         return index.view(len(points), -1), mask.view(len(points), -1)
 
@@ -301,7 +301,8 @@ class CompactNetwork(nn.Module):
         squared = (steps.position[:, :, None] - centers[:, :, :, None]).square().sum(-1)  # [B, M, A, A]
         is_self = torch.eye(num_agents, dtype=torch.bool, device=speed.device)
         squared = squared.masked_fill(is_padding[:, None, None] | is_self, torch.inf)[rows]
-        squared, neighbor = squared.topk(min(self.config.max_agent_neighbors, num_agents), largest=False)  # [R, K]
+        limit = min(self.config.max_agent_neighbors, num_agents)
+        squared, neighbor = squared.topk(limit, largest=False, sorted=False)  # [R, K]
         # 2. relations, with both velocities
         scenario, simulation, _ = rows
         index = neighbor + ((scenario * num_simulations + simulation) * num_agents)[:, None]
@@ -322,7 +323,9 @@ class CompactNetwork(nn.Module):
         logits = hidden.new_empty(len(hidden), scene.offset.shape[1])
         for index, (weight, offset) in enumerate(zip(scene.head, scene.offset)):
             rows = (class_id == index).nonzero()[:, 0]
-            logits = logits.index_copy(0, rows, torch.addmm(offset, hidden.index_select(0, rows), weight.mT))
+            if len(rows) == len(logits):
+                return torch.addmm(offset, hidden, weight.mT)
+            logits = logits.index_copy_(0, rows, torch.addmm(offset, hidden.index_select(0, rows), weight.mT))
         return logits
 
 
