@@ -223,7 +223,7 @@ def test_an_open_world_that_the_policy_drives_alone_is_a_simulation(policy, cros
     track = np.stack([step[0] for step in state.track[CURRENT_STEP + 1 :]], 1)
     valid = reference.valid[0, 0].numpy()
     np.testing.assert_array_equal(track[..., :2].astype(np.float32), reference.position[0, 0].numpy())
-    np.testing.assert_array_equal(find_presence(world, state)[0][0, :, CURRENT_STEP + 1 :], valid)
+    np.testing.assert_array_equal(find_presence(world, state)[0][CURRENT_STEP + 1 :, 0].T, valid)
     assert (valid[:, 1:] & ~valid[:, :-1]).any()
     assert np.linalg.norm(track[valid][:, 3:], axis=-1).max() < 30.0  # who enters has not jumped
 
