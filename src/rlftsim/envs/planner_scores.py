@@ -69,6 +69,12 @@ PDMS_STEPS = 40
 WEIGHTS = {"progress": 5.0, "time_to_collision": 5.0, "speed_limit": 4.0, "comfort": 2.0}
 PDMS_WEIGHTS = {"time_to_collision": 5.0, "progress": 5.0, "comfort": 2.0}
 VULNERABLE = (ObjectType.PEDESTRIAN, ObjectType.CYCLIST)
+RISKY_TTC_S = 1.0
+INFEASIBLE_CURVATURE = 0.3
+"""Turn per meter driven over half a second, rad/m: tighter than a radius of 3.3 m."""
+SPAN_STEPS = 5
+SLOW_MPS = 1.0
+"""Curvature is not measured below this speed."""
 
 
 @dataclass(frozen=True)
@@ -413,14 +419,8 @@ def _displacement(record: Record) -> float:
     return float(np.linalg.norm(offset[is_logged], axis=1).mean())
 
 
-RISKY_TTC_S = 1.0
 INFEASIBLE_ACCELERATION_MPS2 = 8.0
 """Change of speed over half a second."""
-INFEASIBLE_CURVATURE = 0.3
-"""Turn per meter driven over half a second, rad/m: tighter than a radius of 3.3 m."""
-SPAN_STEPS = 5
-SLOW_MPS = 1.0
-"""Curvature is not measured below this speed."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,17 @@ from rlftsim.training.run_folder import describe_environment, flatten, read_metr
 from rlftsim.viewer.chart import Chart, chart_html, label_ticks
 from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset, table_html, tile_html
 
+MAX_ROWS = 1000
+"""Rows of the index: of more scenarios those that lose most."""
+NOTES = {"oracle": "the log itself: what a perfect simulator would score", "ConstantVelocity": "no model"}
+"""Note on an evaluation by the class of the policy."""
+SETTINGS = ("epochs", "batch_size", "num_rollouts", "learning_rate", "kl.target", "reward")
+"""Settings of a run that a report names."""
+SYNTHETIC_NOTE = (
+    "The scenarios are synthetic (SUMO traffic on invented streets): these numbers show that the pipeline works and "
+    "say nothing about the Waymo Open Motion Dataset."
+)
+
 
 @dataclass(frozen=True)
 class ResultRow:
@@ -334,18 +345,6 @@ def _stacked(across: np.ndarray, diameter: float) -> list[int]:
         last[row : row + 1] = [float(x)]
         rows.append(row)
     return rows
-
-
-MAX_ROWS = 1000
-"""Rows of the index: of more scenarios those that lose most."""
-NOTES = {"oracle": "the log itself: what a perfect simulator would score", "ConstantVelocity": "no model"}
-"""Note on an evaluation by the class of the policy."""
-SETTINGS = ("epochs", "batch_size", "num_rollouts", "learning_rate", "kl.target", "reward")
-"""Settings of a run that a report names."""
-SYNTHETIC_NOTE = (
-    "The scenarios are synthetic (SUMO traffic on invented streets): these numbers show that the pipeline works and "
-    "say nothing about the Waymo Open Motion Dataset."
-)
 
 
 def build_report(

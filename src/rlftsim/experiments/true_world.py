@@ -29,6 +29,8 @@ CHANGED = 0.05
 """Episodes whose scores differ by more are counted."""
 VEHICLE_CONFLICTS = ("following", "merging", "crossing")
 """In the rows; windows with any of these are the conflict windows."""
+DISTANCES_M = (0.0, 1.0, 5.0, 15.0, np.inf)
+REFERENCES = ("replay", "idm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,8 +250,6 @@ def find_interval(draws: Float[np.ndarray, "D"], level: float = 0.95) -> tuple[f
 
 
 SCORE, HIT, AT_FAULT = "nuplan_style", "hit_rate", "at_fault_collision_rate"
-DISTANCES_M = (0.0, 1.0, 5.0, 15.0, np.inf)
-REFERENCES = ("replay", "idm")
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,9 @@ PointById = Mapping[int | np.integer, Sequence[float | int] | np.ndarray]
 
 MAX_LISTED_IDS = 12
 """Object ids that an error message lists at most."""
+MAX_COORDINATE_M = 1e7
+"""Farthest coordinate of a goal, meters in the world frame; UTM coordinates stay within."""
+SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x", pa.float64()), ("y", pa.float64())])
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,11 +281,6 @@ def logged_goals(batch: ScenarioBatch, agent_mask: Bool[Tensor, "B A"] | None = 
 def _select_step(values: Float[Tensor, "B A S k"], step: Int64[Tensor, "B A"]) -> Float[Tensor, "B A k"]:
     index = step[..., None, None].expand(-1, -1, 1, values.shape[-1])  # [B, A, 1, k]
     return values.gather(2, index)[:, :, 0]
-
-
-MAX_COORDINATE_M = 1e7
-"""Farthest coordinate of a goal, meters in the world frame; UTM coordinates stay within."""
-SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x", pa.float64()), ("y", pa.float64())])
 
 
 def write_goal_file(path: Path, goals: Mapping[str, Points]) -> None:

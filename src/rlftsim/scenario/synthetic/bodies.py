@@ -29,6 +29,14 @@ SumoPose = tuple[float, float, float]
 """Position that SUMO reports, of a vehicle the front bumper's, and the angle in degrees clockwise from north."""
 BodyMotion = tuple[float, float, float, float, float]
 """x, y, heading, vx, vy of the center."""
+MIN_STEPS = 12
+LONGEST_STRIDE_M = 1.6
+SMALLEST_JUMP_M = 0.3
+"""Smallest sideways jump that is a lane change.
+
+Lanes that follow one another may not quite meet: bicycles keep right in a car's lane.
+"""
+LONGEST_EVALUATED_M = 7.0
 
 
 class BodyShape(NamedTuple):
@@ -346,15 +354,6 @@ def add_label_noise(
 
 
 # --- files of SUMO ---------------------------------------------------------------------------------------------------
-
-MIN_STEPS = 12
-LONGEST_STRIDE_M = 1.6
-SMALLEST_JUMP_M = 0.3
-"""Smallest sideways jump that is a lane change.
-
-Lanes that follow one another may not quite meet: bicycles keep right in a car's lane.
-"""
-LONGEST_EVALUATED_M = 7.0
 
 
 def _read_users(
