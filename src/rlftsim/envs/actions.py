@@ -195,14 +195,27 @@ class Bicycle(Controls):
 
 @compiled
 @no_type_check
+def wrap(angle):
+    """The same angle in [-pi, pi), as `geometry.wrapped`."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+@compiled
+@no_type_check
+def sign_speed(vx, vy, cos, sin):
+    """Speed, negative for an agent that moves backwards, m/s, as `signed_speed`; cosine and sine are the heading's."""
+    speed = np.hypot(vx, vy)
+    return -speed if vx * cos + vy * sin < 0 else speed
+
+
+@compiled
+@no_type_check
 def _drive_bicycles(rows, reverse):
     """Motion [n, 5] of bicycles with x, y, heading, vx, vy, acceleration, steering and length [n, 8]."""
     motion = np.empty((len(rows), 5))
     for i in range(len(rows)):
         x, y, heading, vx, vy, acceleration, steering, length = rows[i]
-        speed = np.hypot(vx, vy)
-        if vx * math.cos(heading) + vy * math.sin(heading) < 0:
-            speed = -speed
+        speed = sign_speed(vx, vy, math.cos(heading), math.sin(heading))
         new_speed = speed + acceleration * STEP_S
         if not reverse:
             # a vehicle that backs up already brakes until it stands: nothing stops at once
@@ -213,7 +226,7 @@ def _drive_bicycles(rows, reverse):
         turn = mean_speed * math.cos(slip) * math.tan(steering) / (WHEELBASE_PER_LENGTH * length) * STEP_S
         chord = mean_speed * STEP_S * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)  # of the arc
         chord_direction = heading + slip + turn / 2
-        new_heading = (heading + turn + math.pi) % (2 * math.pi) - math.pi
+        new_heading = wrap(heading + turn)
         direction = new_heading + slip
         motion[i, 0] = x + chord * math.cos(chord_direction)
         motion[i, 1] = y + chord * math.sin(chord_direction)

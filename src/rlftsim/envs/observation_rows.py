@@ -9,9 +9,10 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
-from rlftsim.envs.actions import WHEELBASE_PER_LENGTH
+from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, sign_speed, wrap
 from rlftsim.envs.compiled import compiled
 from rlftsim.envs.scene import GREEN, RED, YELLOW
+from rlftsim.envs.step_measures import find_on_route
 from rlftsim.scenario.types import STEP_S
 
 SEEN_M = 100.0
@@ -202,11 +203,7 @@ def _compare_with_lane(maps, b, rows, pose, ego):
 @no_type_check
 def _observe_route(routes, m, pose, frame, arrays):
     """Write the route from the place nearest to an agent on, and its end."""
-    first, min_squared = 0, np.inf
-    for row in range(routes.length[m]):
-        to_x, to_y = routes.points[m, row, 0] - pose[0], routes.points[m, row, 1] - pose[1]
-        if to_x * to_x + to_y * to_y < min_squared:
-            first, min_squared = row, to_x * to_x + to_y * to_y
+    first = find_on_route(routes, m, pose[0], pose[1])
     for i in range(min(arrays.route.shape[1], routes.length[m] - first)):
         arrays.route_mask[m, i] = 1
         _write_point(routes.points[m, first + i, 0], routes.points[m, first + i, 1], frame, arrays.route[m, i], 0)
@@ -250,15 +247,14 @@ def _observe_ego(maps, states, m, b, a, frame, arrays):
     for t in range(len(states.track)):
         motion, history = states.track[t][b, a], arrays.ego_history[m, t]
         cos, sin = states.directions[t][b, a]
-        is_backward = motion[3] * cos + motion[4] * sin < 0
-        last_speed, speed = speed, np.hypot(motion[3], motion[4]) * (-1.0 if is_backward else 1.0)
+        last_speed, speed = speed, sign_speed(motion[3], motion[4], cos, sin)
         if states.is_present[t, b, a]:
             _write_point(motion[0], motion[1], frame, history, 0)
             _write_vector(cos, sin, frame, history, 2)
             history[4] = speed
     ego, facts = arrays.ego[m], maps.agent_facts[maps.of_scene[b], a]
     turn = states.track[-1][b, a, 2] - states.track[-2][b, a, 2]
-    yaw_rate = ((turn + math.pi) % (2 * math.pi) - math.pi) / STEP_S
+    yaw_rate = wrap(turn) / STEP_S
     ego[0], ego[1], ego[2] = speed, (speed - last_speed) / STEP_S, yaw_rate
     if abs(speed) > 0.1:
         ego[3] = math.atan(WHEELBASE_PER_LENGTH * float(facts[0]) * yaw_rate / speed)
