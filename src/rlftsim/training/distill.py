@@ -170,10 +170,7 @@ def roll_out(
     tokens = lesson.tokens
 
     def choose(distribution: Any, state: Any, sampling: Sampling, noise: Tensor) -> Int64[Tensor, "B N A"]:
-        scenario, _, agent = find_rows(
-            distribution.mask, is_dense=len(distribution.logits) == distribution.mask.numel()
-        )
-        probability = tokens.project(distribution.log_probs.exp(), batch.object_type[scenario, agent])
+        probability, _ = project(lesson, distribution, batch)
         cumulative = probability.cumsum(-1)
         level = pick_rows(noise, distribution.mask, len(cumulative) == distribution.mask.numel()) * cumulative[:, -1:]
         drawn = torch.searchsorted(cumulative, level, right=True).clamp(max=cumulative.shape[1] - 1)[:, 0]
@@ -202,5 +199,17 @@ def judge(lesson: Lesson, batch: ScenarioBatch, simulated: Rollouts) -> tuple[Fl
     """
     in_large = replace(simulated, decision=lesson.tokens.to_large(simulated.decision, batch.object_type))
     scores = lesson.teacher.score(lesson.teacher.encode(batch), in_large)
-    rows = find_rows(scores.mask, is_dense=len(scores.logits) == scores.mask.numel())
-    return lesson.tokens.project(scores.log_probs.exp(), batch.object_type[rows[0], rows[2]]), rows[1]
+    return project(lesson, scores, batch)
+
+
+def project(lesson: Lesson, distribution: Any, batch: ScenarioBatch) -> tuple[Float[Tensor, "R V"], Int64[Tensor, "R"]]:
+    """Probabilities of the student's tokens by a distribution of the teacher, and the rollout of each of its rows.
+
+    Args:
+        lesson: Student and teacher, with tokens on the device of the batch.
+        distribution: Distributions [B, N, A] or [B, N, A, L] of the teacher, R rows.
+        batch: Scenarios of the distributions.
+    """
+    mask = distribution.mask
+    scenario, rollout, agent, *_ = find_rows(mask, is_dense=len(distribution.logits) == mask.numel())
+    return lesson.tokens.project(distribution.log_probs.exp(), batch.object_type[scenario, agent]), rollout

@@ -15,8 +15,8 @@ from rlftsim.policies.checkpoint import read_model
 from rlftsim.policies.distributions import TokenDistribution
 from rlftsim.policies.smart.compact_network import CompactNetwork, Scene, Steps
 from rlftsim.policies.smart.config import CompactConfig
-from rlftsim.policies.smart.model import load_token_model, save_token_model
-from rlftsim.policies.smart.token_steps import apply_decisions, begin_elsewhere, build_logged_steps
+from rlftsim.policies.smart.model import TokenModule, load_token_model, save_token_model
+from rlftsim.policies.smart.token_steps import apply_decisions, begin_elsewhere, build_logged_steps, replay_decisions
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
@@ -48,7 +48,7 @@ class State:
     draws: Tensor | None = None
 
 
-class CompactPolicy(nn.Module):
+class CompactPolicy(TokenModule):
     """Next-token traffic model of all agents of a scenario, with few weights, that follows no goals.
 
     Args:
@@ -69,12 +69,6 @@ class CompactPolicy(nn.Module):
 
     def __repr__(self) -> str:
         return f"CompactPolicy({sum(weight.numel() for weight in self.parameters()):,} weights)"
-
-    def _apply(self, fn, recurse: bool = True):
-        """Moves to a device take the vocabulary along."""
-        super()._apply(fn, recurse)
-        self.vocabulary = self.vocabulary.to(next(self.parameters()).device)
-        return self
 
     def head_modules(self) -> tuple[nn.Module, ...]:
         """The layers that turn an agent's features into logits of tokens."""
@@ -159,13 +153,8 @@ class CompactPolicy(nn.Module):
             context: Result of `encode` for the scenarios.
             rollouts: Rollouts of the same scenarios, by a policy with the same tokens.
         """
-        states = [self.begin(context, rollouts.num_rollouts, None, rollouts.log_prob[..., :0])]
-        for index in range(rollouts.decision.shape[3] - 1):
-            start = index * STEPS_PER_TOKEN
-            forced = rollouts.forced and rollouts.forced.steps(start, start + STEPS_PER_TOKEN)
-            states.append(self.advance(context, states[-1], rollouts.decision[..., index], forced))
         # all decisions at once, like so many rollouts [B, N L, A]
-        fields = zip(*(vars(state.steps).values() for state in states))
+        fields = zip(*(vars(state.steps).values() for state in replay_decisions(self, context, rollouts)))
         logits = self.network(context.scene, Steps(*(torch.stack(values, 2).flatten(1, 2) for values in fields)))
         shape = rollouts.decision.shape
         mask = context.agent_mask[:, None, :, None].expand(shape)

@@ -82,11 +82,20 @@ def load_token_model(model: StoredModel, config_type: type[Any], make: Callable[
     return load_network(lambda: make(config, vocabulary), weights, source=model.folder)
 
 
-class SmartModel(nn.Module):
-    """SMART's network and vocabulary; `SmartPolicy` adds the decisions.
+class TokenModule(nn.Module):
+    """Network with a vocabulary: a value, not a weight, saved beside the weights and never trained."""
 
-    The vocabulary is a value, not a weight: saved beside the weights and never trained.
-    """
+    vocabulary: Vocabulary
+
+    def _apply(self, fn, recurse: bool = True):
+        """Moves to a device take the vocabulary along."""
+        super()._apply(fn, recurse)
+        self.vocabulary = self.vocabulary.to(next(self.parameters()).device)
+        return self
+
+
+class SmartModel(TokenModule):
+    """SMART's network and vocabulary; `SmartPolicy` adds the decisions."""
 
     architecture = "smart"
 
@@ -105,12 +114,6 @@ class SmartModel(nn.Module):
         class_sizes = tuple(vocabulary.token_mask.sum(1).tolist()) if config.head_per_class else ()
         num_map_points = vocabulary.map_prototypes.shape[1]
         self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes, num_map_points)
-
-    def _apply(self, fn, recurse: bool = True):
-        """Moves to a device take the vocabulary along."""
-        super()._apply(fn, recurse)
-        self.vocabulary = self.vocabulary.to(next(self.parameters()).device)
-        return self
 
     # ---- training -------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ and files.
 B scenarios, N rollouts, A agents, L decisions, K token steps, D width, R selected elements, V tokens.
 """
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +22,7 @@ from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, EncodedGoals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import Past, Scene, View
-from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere
+from rlftsim.policies.smart.token_steps import TokenSteps, apply_decisions, begin_elsewhere, replay_decisions
 from rlftsim.rollout.policy import DecisionDistribution, Prediction
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -221,12 +222,7 @@ class SmartPolicy(SmartModel):
 
         The decoder is not run: but for the past, no value depends on weights that fine-tuning trains.
         """
-        state = self.begin(context, rollouts.num_rollouts, rollouts.goals, rollouts.log_prob[..., :0])
-        # the last decision leads nowhere that is scored
-        for index in range(rollouts.decision.shape[3] - 1):
-            start = index * STEPS_PER_TOKEN
-            forced = rollouts.forced and rollouts.forced.steps(start, start + STEPS_PER_TOKEN)
-            state = self.advance(context, state, rollouts.decision[..., index], forced)
+        state = deque(replay_decisions(self, context, rollouts), maxlen=1).pop()  # no earlier one stays in memory
         steps = state.pending
         return state, None if steps is None else self.network.decoder.look(context.scene, steps, state.past)
 

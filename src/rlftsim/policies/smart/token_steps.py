@@ -3,14 +3,17 @@
 B scenarios, N rollouts, A agents, K token steps of a block. Map frame, meters and radians.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
-from rlftsim.rollout.types import FARTHEST_STEP_M, AgentStates
+from rlftsim.rollout.policy import TokenPolicy
+from rlftsim.rollout.types import FARTHEST_STEP_M, AgentStates, Rollouts
 from rlftsim.tokens import catk_compat as catk_ops
 from rlftsim.tokens.agent_tokens import AgentTokens, class_boxes, nearest_tokens
 from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
@@ -123,3 +126,21 @@ def apply_decisions(
     corners = box_corners(end_position, end_heading, length[:, None], width[:, None])  # [B, N, A, 4, 2]
     local = rotate(corners - position[..., None, :], -heading[..., None])
     return poses, torch.where(is_imposed, nearest_tokens(local, class_id, is_imposed, vocabulary), decision)
+
+
+def replay_decisions(policy: TokenPolicy, context: Any, rollouts: Rollouts) -> Iterator[Any]:
+    """Yield the state of a policy before each decision of rollouts.
+
+    Args:
+        policy: Policy that starts without noise, and decides nothing here.
+        context: Context of the scenarios, made by the same policy.
+        rollouts: Rollouts of the same scenarios, whose decisions are taken, and states imposed as they were.
+    """
+    stride, noise = policy.steps_per_decision, rollouts.log_prob[..., :0]
+    state = policy.begin(context, rollouts.num_rollouts, rollouts.goals, noise)
+    yield state
+    # the last decision leads nowhere that is scored
+    for index in range(rollouts.decision.shape[3] - 1):
+        forced = rollouts.forced and rollouts.forced.steps(index * stride, (index + 1) * stride)
+        state = policy.advance(context, state, rollouts.decision[..., index], forced)
+        yield state
