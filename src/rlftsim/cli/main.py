@@ -5,6 +5,7 @@ Only the module of the verb is imported, and help texts do not import torch.
 
 import difflib
 import errno
+import inspect
 import io
 import os
 import signal
@@ -62,7 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(SCRIPT if words[1:] in (["bash"], ["zsh"]) else "\n".join(list_next_words(words[1:])))
             return 0
         call = parse(words)
-        return call.show(call.command.function(**call.arguments))
+        # Unwrapped: the parser has checked names and numbers of the arguments.
+        return call.show(inspect.unwrap(call.command.function)(**call.arguments))
     except RlftsimError as error:
         if shows_traceback:
             raise

@@ -103,7 +103,6 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
 
 
 @with_checked_arguments
-@repeat_for_seeds
 def finetune(
     policy: Model,
     scenarios: Data,
@@ -185,6 +184,8 @@ def finetune(
         CheckpointError: The folder holds another run, or the run diverged (the message names its last good checkpoint).
         NotYetError: Another run is at work in the folder.
     """
+    if seeds is not None:
+        return repeat_for_seeds(finetune, locals(), seeds)
     if isinstance(config, PretrainConfig) or find_method(config) is None:
         check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training = to_scenarios(scenarios, split, limit)

@@ -68,7 +68,6 @@ def check_flags(values: Mapping[str, Any], recipe: Recipe, flags: Sequence[str])
 
 
 @with_checked_arguments
-@repeat_for_seeds
 def pretrain(
     policy: ModelOrRecipe,
     scenarios: Data,
@@ -140,6 +139,8 @@ def pretrain(
         CheckpointError: The folder holds another run, or the run diverged.
         NotYetError: Another run is at work in the folder.
     """
+    if seeds is not None:
+        return repeat_for_seeds(pretrain, locals(), seeds)
     check_config(config, "pretrain", PretrainConfig)
     training = to_scenarios(scenarios, split, limit)
     recipe, start = None, policy
@@ -155,15 +156,13 @@ def pretrain(
     held_out = None if held_out is None else to_scenarios(held_out)
     if start is None:
         assert recipe is not None
-        fresh = to_recipe(recipe)
-        # weights are drawn with the recipe's seed
+        fresh = to_recipe(recipe)  # weights are drawn with the recipe's seed
         learner: Any = (fresh if seed is None else replace(fresh, pretrain=settings)).new_policy_for(training, tokens)
         device = get_device(learner)
     else:
         learner, device = load_start(start)
         if recipe is not None:
-            # without a vocabulary all that recipes of other packages may know
-            replaced: Any = () if tokens is None else (tokens, keep_tokens)
+            replaced: Any = () if tokens is None else (tokens, keep_tokens)  # recipes of others may know no tokens
             like = recipe if isinstance(recipe, Recipe) else _to_recipe_like(recipe_by_name(recipe), learner)
             learner = like.train_further(learner, *replaced)
     card = write_card("pre-trained" if start is None else "pre-trained further", training, start)

@@ -5,10 +5,8 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
-from inspect import signature
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.table import Table
@@ -23,7 +21,6 @@ VALIDATION, BOUND = "validation_rmm", "validation_gain_low"
 MEASURES = (VALIDATION, "rmm", "loss", "imitation_loss")
 """Metrics that say how good a model is, the most telling first; losses are better where they are lower."""
 NO_VALUE = "–"
-Parameters = ParamSpec("Parameters")
 Trained = TypeVar("Trained")
 SEED_FOLDER = "seed-"
 """Beginning of the name of a run's folder, of several that differ in the seed alone."""
@@ -185,26 +182,24 @@ def _format(value: Any) -> str:
     return NO_VALUE if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
-def repeat_for_seeds(verb: Callable[Parameters, Trained]) -> Callable[Parameters, Trained]:
-    """Decorator of a verb that trains: `seeds` repeats the verb with a seed and a folder for each run.
+def repeat_for_seeds(verb: Callable[..., Trained], arguments: Mapping[str, Any], seeds: int) -> Trained:
+    """Train several times, with a seed and a folder for each run; returns the policy of the first run.
 
-    The policy of the first run is returned.
+    Args:
+        verb: Verb that trains, called without `seeds` for each run.
+        arguments: Arguments of the verb by name.
+        seeds: Number of runs, with the seeds 0, 1, 2 and so on.
+
+    Raises:
+        ConfigError: No run, no folder for the runs, or a seed for all.
     """
-
-    @wraps(verb)
-    def train_runs(*arguments: Any, seeds: int | None = None, **options: Any) -> Trained:
-        if seeds is None:
-            return verb(*arguments, **options)
-        call = signature(verb).bind(*arguments, **options).arguments
-        if call.get("out") is None or call.get("seed") is not None:
-            raise ConfigError(f"seeds={seeds}: several runs need a folder for theirs, out, and each has its seed.")
-        policies = []
-        for seed in range(whole_number("seeds", seeds, 1)):
-            changes = {**call, "out": Path(call["out"]) / f"{SEED_FOLDER}{seed}", "seed": seed}
-            policies.append(verb(**changes))  # pyright: ignore[reportCallIssue] (the same arguments by name)
-        return policies[0]
-
-    return train_runs
+    if arguments["out"] is None or arguments["seed"] is not None:
+        raise ConfigError(f"seeds={seeds}: several runs need a folder for theirs, out, and each has its seed.")
+    policies = []
+    for seed in range(whole_number("seeds", seeds, 1)):
+        out = Path(arguments["out"]) / f"{SEED_FOLDER}{seed}"
+        policies.append(verb(**{**arguments, "out": out, "seed": seed, "seeds": None}))
+    return policies[0]
 
 
 def print_model(policy: Any, *, out: Path, seeds: int | None) -> None:
