@@ -141,10 +141,10 @@ def measure_items(count: int) -> dict[str, float]:
             advance(1)
 
         for name in ("first", "again"):
-            began, runner = time.process_time(), Inline()
-            with Lease(folder / ".lock", runner, "works in") as lease:
+            began = time.process_time()
+            with Lease(folder / ".lock", Inline(), "works in") as lease:
                 files = WholeFiles(folder, str, Path.read_text)
-                run_items("items", range(count), work, format=files, lease=lease, runner=runner, show_progress=False)
+                run_items("items", range(count), work, format=files, lease=lease, show_progress=False)
             numbers[name] = 1000 * (time.process_time() - began) / count
         return numbers | {"memory": peak_mb() - start}
 

@@ -1,6 +1,7 @@
 import json
 import multiprocessing
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +16,8 @@ from rlftsim.evaluation import evaluate as module
 from rlftsim.evaluation import rollout_states
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
-from rlftsim.evaluation.resumable import ScenarioRows, make_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, open_evaluation
+from rlftsim.jobs.items import do_group, run_items
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -230,7 +232,7 @@ def test_only_the_files_of_an_evaluation_are_removed_with_its_parts(data, tmp_pa
 def test_parts_of_another_policy_are_replaced_with_a_message(data, tmp_path, capsys):
     expected = evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="expected")
     old = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
-    parts = ScenarioRows("parts", old.provenance, tmp_path)
+    parts = ScenarioRows("parts", old.provenance, tmp_path, old.scenario_ids)
     parts.write(range(0, 4), [dict(row) for row in old.table.slice(0, 4).to_pylist()])
     assert same(evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="parts"), expected)
     assert "another policy_fingerprint: discarded" in capsys.readouterr().err
@@ -338,8 +340,10 @@ def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, t
         return {"scenario_id": scenario_id, **row} if position % 3 else module.Skipped(scenario_id, "a third is")
 
     ids = [f"s{position}" for position in range(10)]
-    make_evaluation("make", "made", provenance, tmp_path, ids, work, runner=Inline(), jobs=1, show_progress=False)
-    result = ScenarioRows("made", provenance, tmp_path).read_finished(ids)
+    with open_evaluation("made", provenance, tmp_path, ids, runner=Inline(), jobs=1) as (rows, lease):
+        task = partial(do_group, work, rows)
+        rows.join(run_items("make", rows.groups, task, format=rows, lease=lease, show_progress=False))
+    result = ScenarioRows("made", provenance, tmp_path, ids).read_finished()
     assert (done, result.scenario_ids) == (list(range(10)), ["s1", "s2", "s4", "s5", "s7", "s8"])
     assert [skipped.scenario_id for skipped in result.skipped] == ["s0", "s3", "s6", "s9"]
 

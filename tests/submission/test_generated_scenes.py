@@ -10,13 +10,14 @@ import pytest
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.evaluation.rollout_states import generate_states
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.evaluation.submission_pb2 import ScenarioRollouts
 from rlftsim.geometry import boxes_overlap
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import SCENARIO_GEN, SIM_AGENTS
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.rollout.scene_draw import draw_scene
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.submission.build import build_archive
 from rlftsim.submission.check import check_archive
@@ -42,7 +43,7 @@ def shards(data):
     """An archive's messages, to be damaged."""
     shards = {}
     for drawn in data[:2]:
-        states = generate_states(entries.Wanderer(), drawn, EvaluateConfig(metric=METRIC))
+        states = simulate_states(entries.Wanderer(), collate([drawn]), EvaluateConfig(metric=METRIC))
         shards[drawn.scenario_id] = ScenarioRollouts.FromString(
             encode_rollouts(drawn.scenario_id, states, drawn.tracks.object_type[drawn.simulated_indices])
         )
@@ -67,7 +68,7 @@ def agents(scenes):
 def test_bytes_are_those_of_protobuf_and_come_back(data, shards):
     drawn = data[0]
     message = shards[drawn.scenario_id]
-    states = generate_states(entries.Wanderer(), drawn, EvaluateConfig(metric=METRIC))
+    states = simulate_states(entries.Wanderer(), collate([drawn]), EvaluateConfig(metric=METRIC))
     types = drawn.tracks.object_type[drawn.simulated_indices]
     written = encode_rollouts(drawn.scenario_id, states, types)
     assert message.SerializeToString() == written

@@ -18,7 +18,7 @@ from rlftsim.evaluation.resumable import (
     ScenarioValues,
     check_same_work,
     check_scenarios_stay,
-    make_result,
+    open_result,
     read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
@@ -130,37 +130,30 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    files = _SideBySide(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
+    files = ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing)
     runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
 
-    def make(lease: Lease) -> DriveResult:
+    with open_result(path, files, find, runner) as opened:
+        if not isinstance(opened, Lease):
+            return opened
         groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
         title = f"{config.planner} in {settings.traffic}"
         task = partial(_drive_group, config, settings.traffic, files)
-        stored = run_items(title, groups, task, format=files, lease=lease, runner=runner)
+        stored = run_items(title, groups, task, format=files, lease=opened)
         rows = [row for group in stored for row in group]
         missing = {row["scenario_id"]: reasons for row, reasons in rows}
-        return DriveResult.of(settings, [row for row, _ in rows], missing)
-
-    return make_result(path, files, ids, find, runner, make)
+        result = DriveResult.of(settings, [row for row, _ in rows], missing)
+        result.write(path)
+    return result
 
 
 Row = tuple[dict[str, Any], dict[str, str]]
 
 
-class _SideBySide(ScenarioValues[Any]):
-    """Scenarios that are driven side by side, with a file for each."""
-
-    def read(self, item: range) -> list[Row] | None:
-        """Rows of all scenarios of a group, see `ResultFormat`."""
-        rows: list[Any] = [ScenarioValues.read(self, range(position, position + 1)) for position in item]
-        return None if None in rows else rows
-
-
 def _drive_group(
     config: DriveConfig,
     traffic: str,
-    files: _SideBySide,
+    files: ScenarioValues[Row],
     group: range,
     advance: Advance,
     is_stopped: Callable[[], bool],

@@ -3,6 +3,7 @@
 An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -10,11 +11,12 @@ from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import make_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, open_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
-from rlftsim.evaluation.rollout_states import Oracle, simulate_evaluated
+from rlftsim.evaluation.rollout_states import Oracle, simulate_states
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
-from rlftsim.jobs.runner import Runner, check_jobs
+from rlftsim.jobs.items import iterate_positions, run_items
+from rlftsim.jobs.runner import Advance, Runner, check_jobs
 from rlftsim.realism import metric_by_name, scenario_log, score
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy, get_device, is_goal_conditioned
@@ -54,9 +56,9 @@ def evaluate(
         ConfigError: An impossible name, a stored result of other work, several processes for a policy on a GPU, goals
             for a policy that is not goal-conditioned, or a limit that would replace a result of more scenarios.
     """
-    is_oracle = isinstance(policy, str)
-    title, fingerprint = ("oracle", "oracle") if is_oracle else (type(policy).__name__, fingerprint_policy(policy))
-    name = name or (title if is_oracle else f"{title}-{fingerprint[:8]}")
+    title = policy if isinstance(policy, str) else type(policy).__name__
+    fingerprint = policy if isinstance(policy, str) else fingerprint_policy(policy)
+    name = name or (title if title == fingerprint else f"{title}-{fingerprint[:8]}")
     if config.goals != "none" and not is_goal_conditioned(policy):
         raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
     if config.goals != "none" and config.challenge.makes_scenes:
@@ -66,7 +68,7 @@ def evaluate(
     ids = choose_scenarios(dataset, config)
     check_jobs(config.jobs, get_device(policy))
     frozen: Policy | Oracle = frozen_copy(policy)
-    if frozen != "oracle":
+    if not isinstance(frozen, str):
         check_sampling(frozen, dataset, config.sampling)
     provenance = Provenance(
         config=replace(config, jobs=1),  # the same bytes from any number of processes
@@ -74,13 +76,15 @@ def evaluate(
         policy_fingerprint=fingerprint,
         dataset=dataset.url or str(dataset.folder.resolve()),
         manifest_sha256=hash_manifest(dataset.folder),
-        sources=dataset.sources,
-        guessed=dataset.guessed,
-    )
-    work = partial(_evaluate_scenario, frozen, dataset, config)
-    return make_evaluation(
-        "evaluate", name, provenance, out, ids, work, runner=runner, jobs=config.jobs, show_progress=show_progress
-    )
+        sources=dataset.sources, guessed=dataset.guessed,
+    )  # fmt: skip
+    with open_evaluation(name, provenance, out, ids, runner=runner, jobs=config.jobs) as (rows, opened):
+        if isinstance(opened, Evaluation):
+            return opened
+        task = partial(_evaluate_scenarios, frozen, dataset, config, rows)
+        return rows.join(
+            run_items(f"evaluate {name}", rows.groups, task, format=rows, lease=opened, show_progress=show_progress)
+        )
 
 
 def evaluation_name(model: str | PathLike[str]) -> str:
@@ -105,27 +109,37 @@ def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: Evalu
     }
 
 
-def _evaluate_scenario(
-    policy: Policy | Oracle, dataset: ScenarioDataset, config: EvaluateConfig, position: int
-) -> dict[str, object] | Skipped:
-    """Row of a scenario, or the reason for a missing row."""
-    scenario = dataset[position]
-    try:
-        scenario.check_consistency()
-        scenario.check_finite_arrays()
-    except DataError as error:
-        # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
-        raise DataError(
-            f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
-            "such scenarios out."
-        ) from None
-    # Without a road edge, for instance, the official metric is undefined.
-    try:
-        log = scenario_log(scenario, get_device(policy), challenge=config.challenge)
-    except DataError as error:
-        return Skipped(scenario.scenario_id, str(error))
-    states = simulate_evaluated(policy, collate([scenario]), config)
-    if position == 0 and not isinstance(policy, str):  # a wrong unit or frame shows in any scenario
-        warn_of_doubts(scenario, states, f"rollouts of {type(policy).__name__}")
-    result = score(log, states, metric_by_name(config.metric))
-    return row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id))
+def _evaluate_scenarios(
+    policy: Policy | Oracle,
+    dataset: ScenarioDataset,
+    config: EvaluateConfig,
+    rows: ScenarioRows,
+    group: range,
+    advance: Advance,
+    is_stopped: Callable[[], bool],
+) -> None:
+    """Write the rows of a group of scenarios, and the reasons for missing rows."""
+    results: list[Mapping[str, object] | Skipped] = []
+    for position in iterate_positions(group, advance, is_stopped):
+        scenario = dataset[position]
+        try:
+            scenario.check_consistency()
+            scenario.check_finite_arrays()
+        except DataError as error:
+            # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
+            raise DataError(
+                f"{dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
+                "such scenarios out."
+            ) from None
+        # Without a road edge, for instance, the official metric is undefined.
+        try:
+            log = scenario_log(scenario, get_device(policy), challenge=config.challenge)
+        except DataError as error:
+            results.append(Skipped(scenario.scenario_id, str(error)))
+            continue
+        states = simulate_states(policy, collate([scenario]), config)
+        if position == 0 and not isinstance(policy, str):  # a wrong unit or frame shows in any scenario
+            warn_of_doubts(scenario, states, f"rollouts of {type(policy).__name__}")
+        result = score(log, states, metric_by_name(config.metric))
+        results.append(row_of_result(result, scenario, states, dataset.find_cluster(scenario.scenario_id)))
+    rows.write(group, results)

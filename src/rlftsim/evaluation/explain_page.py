@@ -17,8 +17,8 @@ from rlftsim import __version__
 from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
-from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
-from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
+from rlftsim.evaluation.scenario_source import ScenarioSource, has_road_edge, hash_source, open_scenarios
+from rlftsim.evaluation.score_files import ScoreConfig, check_entries, hash_entries
 from rlftsim.jobs.files import remove_folder, remove_temporaries, write_atomically, write_text
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
@@ -106,7 +106,7 @@ def write_files(
             return written
     with Lease(folder / ".lock", runner, "works in") as lease:
         finished = run_items(
-            title, list(items.items()), partial(_write_file, write, folder), lease=lease, runner=runner,
+            title, list(items.items()), partial(_write_file, write, folder), lease=lease,
             format=WholeFiles(folder, itemgetter(0), _read_page),
         )  # fmt: skip
         files = [file for file in finished if file.stat().st_size]

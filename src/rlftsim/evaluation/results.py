@@ -328,19 +328,6 @@ def _check_scores(table: pa.Table) -> None:
             raise DataError(f"{name} of scenario {scenario_id} is {values[row]:g}, not {limits}")
 
 
-def join_evaluations(name: str, provenance: Provenance, evaluations: list[Evaluation]) -> Evaluation:
-    """An evaluation of the scenarios of several evaluations, in the order of the list.
-
-    Args:
-        name: Name of the joined evaluation.
-        provenance: Provenance of the joined evaluation.
-        evaluations: Evaluations of disjoint scenarios.
-    """
-    # the empty table: there may be no evaluation with rows; one chunk, so that equal evaluations have equal tables
-    table = pa.concat_tables([SCHEMA.empty_table(), *(evaluation.table for evaluation in evaluations)]).combine_chunks()
-    return Evaluation(name, provenance, table, tuple(skipped for e in evaluations for skipped in e.skipped))
-
-
 def row_of_result(
     result: RealismResult, scenario: Scenario, states: SimulatedStates, cluster: str | None = None
 ) -> dict[str, object]:

@@ -1,7 +1,7 @@
 """Interruptible measurements of many scenarios: finished groups are stored in files, a later call does the others.
 
 Evaluations and scores of rollout files are stored as `ScenarioRows` (Parquet), goal attainment, reward variances and
-planners as `ScenarioValues` (JSON). `make_result` joins the groups in the file of a result.
+planners as `ScenarioValues` (JSON). Under `open_result` the groups are joined in the file of a result.
 """
 
 import json
@@ -10,23 +10,23 @@ import re
 import tempfile
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, TypeVar
 
 import pyarrow as pa
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
+from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped
 from rlftsim.jobs.buckets import validate_folder
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import check_result_file, remove_folder, remove_temporaries, write_text
 from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
-from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, read_stored, run_items
+from rlftsim.jobs.items import GroupFormat, Result, Stored, do_group, group_positions, read_stored, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Inline, Joining, Runner, Share, choose_runner
 
@@ -38,50 +38,62 @@ class ScenarioFormat(GroupFormat[Stored, Result]):
     """Files of finished groups of scenarios in a folder, removed when the file of the result is written."""
 
     folder: Path
+    scenario_ids: Sequence[str]
+    """In the order of positions."""
+
+    @property
+    def groups(self) -> list[range]:
+        """Positions of the scenarios of each file."""
+        return group_positions(len(self.scenario_ids), self.items_per_file)
 
     @abstractmethod
-    def file_names(self, scenario_ids: Collection[str]) -> list[str]:
-        """Names of the files in the folder that groups of the scenarios may have written, damaged ones included."""
+    def file_names(self) -> list[str]:
+        """Names of the files in the folder that groups may have written, damaged ones included."""
 
     @abstractmethod
-    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
-        """True if the folder holds finished groups of scenarios beside those listed, or of other settings."""
+    def has_other_groups(self) -> bool:
+        """True if the folder holds finished groups of other scenarios or settings."""
 
 
 @dataclass(frozen=True, eq=False)
-class ScenarioValues(ScenarioFormat[Stored, Mapping[str, object]]):
-    """A JSON file per scenario, `<folder>/<scenario id>.json`."""
+class ScenarioValues(ScenarioFormat[list[Stored], Mapping[str, object]]):
+    """A JSON file per scenario, `<folder>/<scenario id>.json`, also of scenarios that are measured together."""
 
     folder: Path
     scenario_ids: Sequence[str]
-    """In the order of positions."""
     identity: Mapping[str, Mapping[str, object]]
     """By scenario id: plain values that a file must agree with to belong to this work."""
     parse: Callable[[str, Mapping[str, Any]], Stored]
     """Reads a scenario's values; a KeyError, TypeError or ValueError means that the file is damaged."""
 
     def write(self, item: range, results: Sequence[Mapping[str, object]]) -> None:
-        """Write the file of a scenario, see `GroupFormat`."""
-        scenario_id = self.scenario_ids[item.start]
-        text = json.dumps({**self.identity[scenario_id], **results[0]})
-        write_text(self.folder / f"{scenario_id}.json", f"{text}\n")
+        """Write the file of each scenario, see `GroupFormat`."""
+        for position, values in zip(item, results):
+            scenario_id = self.scenario_ids[position]
+            text = json.dumps({**self.identity[scenario_id], **values})
+            write_text(self.folder / f"{scenario_id}.json", f"{text}\n")
 
-    def read(self, item: range) -> Stored | None:
-        """The parsed values of a scenario, see `ResultFormat`."""
-        scenario_id = self.scenario_ids[item.start]
-        check_result_file(self.folder / f"{scenario_id}.json")
-        try:
-            values = self._read(scenario_id)
-            return self.parse(scenario_id, values) if self._agrees(scenario_id, values) else None
-        except (DataError, OSError, ValueError, KeyError, TypeError, AttributeError):
-            return None
+    def read(self, item: range) -> list[Stored] | None:
+        """The parsed values of each scenario, see `ResultFormat`."""
+        parsed = []
+        for scenario_id in self.scenario_ids[item.start : item.stop]:
+            check_result_file(self.folder / f"{scenario_id}.json")
+            try:
+                values = self._read(scenario_id)
+                if not self._agrees(scenario_id, values):
+                    return None
+                parsed.append(self.parse(scenario_id, values))
+            except (DataError, OSError, ValueError, KeyError, TypeError, AttributeError):
+                return None
+        return parsed
 
-    def file_names(self, scenario_ids: Collection[str]) -> list[str]:
+    def file_names(self) -> list[str]:
         """A name per scenario, see `ScenarioFormat`."""
-        return [f"{scenario_id}.json" for scenario_id in scenario_ids]
+        return [f"{scenario_id}.json" for scenario_id in self.scenario_ids]
 
-    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
+    def has_other_groups(self) -> bool:
         """True if there are files of other scenarios or settings, see `ScenarioFormat`."""
+        scenario_ids = {*self.scenario_ids}
         for name in (path.stem for path in self.folder.glob("*.json")):
             with suppress(DataError, FileNotFoundError):  # a damaged file holds nothing
                 check_result_file(self.folder / f"{name}.json")
@@ -103,6 +115,7 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
     name: str
     provenance: Provenance
     out: Path
+    scenario_ids: Sequence[str]
 
     items_per_file: ClassVar[int] = 4
 
@@ -144,7 +157,16 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
             log.info(f"{self._path(item)} is of another {', '.join(differences)}: discarded.")
         return None if differences else rows
 
-    def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
+    def join(self, groups: Sequence[Evaluation]) -> Evaluation:
+        """Write the evaluation of all groups, in the order of the list."""
+        # the empty table: there may be no group with rows; one chunk, so that equal evaluations have equal tables
+        table = pa.concat_tables([SCHEMA.empty_table(), *(group.table for group in groups)]).combine_chunks()
+        skipped = tuple(scenario for group in groups for scenario in group.skipped)
+        evaluation = Evaluation(self.name, self.provenance, table, skipped)
+        evaluation.write(self.result_path)
+        return evaluation
+
+    def read_finished(self) -> Evaluation | None:
         """The result of an earlier call for the same scenarios; None without such a result.
 
         Raises:
@@ -158,7 +180,7 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         counts, limit = _count_scenarios(stored), self.provenance.config.limit
         if limit is not None:
             way_out = "name this one apart with --name, or leave the limit out."
-            num_left_out = (counts - Counter(scenario_ids)).total()
+            num_left_out = (counts - Counter(self.scenario_ids)).total()
             check_scenarios_stay(self.result_path, counts.total(), num_left_out, f"limit={limit}", way_out)
         differences = stored.provenance.differences(self.provenance)
         if differences == ["rlftsim_version"]:
@@ -166,18 +188,19 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
             return None
         check_same_work(self.result_path, differences, "choose another --name or --out")
         # counted: a scenario may have several sets of rollouts in files, and one by a policy
-        return stored if counts == Counter(scenario_ids) else None
+        return stored if counts == Counter(self.scenario_ids) else None
 
-    def file_names(self, scenario_ids: Collection[str]) -> list[str]:
+    def file_names(self) -> list[str]:
         """Names of groups of any size, see `ScenarioFormat`."""
         return [path.name for path in self.folder.glob("*.parquet") if _GROUP_NAME.fullmatch(path.stem)]
 
-    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
+    def has_other_groups(self) -> bool:
         """True if a group has other scenarios or settings, see `ScenarioFormat`."""
+        scenario_ids = {*self.scenario_ids}
         stored = (read_stored(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
         return any(
             rows is not None
-            and bool(rows.provenance.differences(self.provenance) or _count_scenarios(rows).keys() - {*scenario_ids})
+            and bool(rows.provenance.differences(self.provenance) or _count_scenarios(rows).keys() - scenario_ids)
             for rows in stored
         )
 
@@ -207,67 +230,27 @@ def measure_scenarios(
         SetAside, Unfinished: See `run_items`.
     """
     with Lease(format.folder / ".lock", runner, "works in") as lease:
-        stored = run_groups(title, format.scenario_ids, work, format, lease, runner)
-        remove_temporaries(format.folder / name for name in format.file_names(format.scenario_ids))
+        groups = run_items(title, format.groups, partial(do_group, work, format), format=format, lease=lease)
+        remove_temporaries(format.folder / name for name in format.file_names())
         lease.remove()
-    return stored
+    return [stored for group in groups for stored in group]
 
 
-def run_groups(
-    title: str,
-    scenario_ids: Sequence[str],
-    work: Callable[[int], Result],
-    format: ScenarioFormat[Stored, Result],
-    lease: Lease,
-    runner: Runner,
-    *,
-    show_progress: bool = True,
-) -> list[Stored]:
-    """Stored results of the groups of scenarios, done now where they are missing, see `run_items`.
-
-    Args:
-        title: Name of the work, in front of the progress bar.
-        scenario_ids: Ids of all scenarios, in the order of the groups.
-        work: Function from the position of a scenario to the result of the scenario.
-        format: Files of the groups.
-        lease: Lock on the folder of the files.
-        runner: Runner of the groups that are missing; changes no result.
-        show_progress: False prints neither progress nor the time left.
-    """
-    groups, task = group_positions(len(scenario_ids), format.items_per_file), group_task(work, format)
-    return run_items(title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress)
+FinishedResult = TypeVar("FinishedResult")
 
 
-@runtime_checkable
-class Writable(Protocol):
-    """A result that is stored in a single file."""
-
-    def write(self, path: Path) -> None:
-        """Write the file, complete or not at all."""
-        ...
-
-
-FinishedResult = TypeVar("FinishedResult", bound=Writable)
-
-
-def make_result(
-    path: Path,
-    format: ScenarioFormat[Any, Any],
-    scenario_ids: Sequence[str],
-    find: Callable[[], FinishedResult | None],
-    runner: Runner,
-    make: Callable[[Lease], FinishedResult],
-) -> FinishedResult:
-    """The result that an earlier call has finished, or else a new one, which is written into its file.
+@contextmanager
+def open_result(
+    path: Path, format: ScenarioFormat[Any, Any], find: Callable[[], FinishedResult | None], runner: Runner
+) -> Iterator[FinishedResult | Lease]:
+    """Yields the result that an earlier call has finished, or else the lock under which a new one is made and written.
 
     Args:
         path: File of the result.
         format: Files of finished groups, removed in the end. All stay if a longer run is unfinished in the folder: with
             further groups, or with lock files of shares while `runner` is no share.
-        scenario_ids: Ids of all scenarios of the result.
         find: Reader of the finished result; returns None for a missing result.
         runner: Runner of the groups that are missing; changes no result.
-        make: Maker of the missing result, called with the lock on the folder of the groups.
 
     Raises:
         DataError: A second driver at work on this result.
@@ -277,44 +260,37 @@ def make_result(
     if stored is not None:
         if format.folder.exists():
             with suppress(DataError), Lease(format.folder / ".lock", Inline(), "works in"):
-                _remove_groups(format, scenario_ids, runner)
-        return stored
+                _remove_groups(format, runner)
+        yield stored
+        return
     with Lease(format.folder / ".lock", runner, "works in") as lease:
+        remove_temporaries([path])  # of a process that was killed
         # another driver may have finished since, so what would be replaced is looked at again
-        result = find() if _stamp(path) != stamp else None
-        if result is None:
-            result = make(lease)
-            remove_temporaries([path])
-            result.write(path)
+        stored = find() if _stamp(path) != stamp else None
+        yield lease if stored is None else stored
         # Only now: an interruption between the two leaves the groups, and the next call finds the result.
-        _remove_groups(format, scenario_ids, runner)
-    return result
+        _remove_groups(format, runner)
 
 
-def make_evaluation(
-    verb: str,
+@contextmanager
+def open_evaluation(
     name: str,
     provenance: Provenance,
     out: str | PathLike[str] | None,
     scenario_ids: Sequence[str],
-    work: Callable[[int], Mapping[str, object] | Skipped],
     *,
     runner: Runner | None,
     jobs: int,
-    show_progress: bool,
-) -> Evaluation:
-    """The evaluation in `out/<name>.parquet`, whose missing groups are done now.
+) -> Iterator[tuple[ScenarioRows, Evaluation | Lease]]:
+    """Yields the files of `out/<name>.parquet`, and the finished evaluation or the lock under which they are joined.
 
     Args:
-        verb: Name of the work, in front of the evaluation's name and the progress bar.
         name: Name of the evaluation and of the file.
         provenance: Values that a stored result must agree with, else the call ends with an error.
         out: Folder of the result; None stores no file.
         scenario_ids: Ids of all scenarios of the evaluation, in the order of the rows.
-        work: Function from the position of a scenario to the row of the scenario.
         runner: Runner of the groups that are missing; changes no result. None = as many processes as `jobs`.
         jobs: Number of processes that share the work.
-        show_progress: False prints neither progress nor the time left.
 
     Raises:
         ConfigError: A name that no file can have, a stored result of other work, a limit that would leave out stored
@@ -326,26 +302,21 @@ def make_evaluation(
         raise ConfigError("shares meet in a folder: name one with --out.")
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
     with tempfile.TemporaryDirectory() as temporary_folder:
-        rows = ScenarioRows(name, provenance, validate_folder(temporary_folder if out is None else out))
-        find = partial(rows.read_finished, scenario_ids)
-
-        def make(lease: Lease) -> Evaluation:
-            groups = run_groups(f"{verb} {name}", scenario_ids, work, rows, lease, runner, show_progress=show_progress)
-            return join_evaluations(name, provenance, groups)
-
-        return make_result(rows.result_path, rows, scenario_ids, find, runner, make)
+        rows = ScenarioRows(name, provenance, validate_folder(temporary_folder if out is None else out), scenario_ids)
+        with open_result(rows.result_path, rows, rows.read_finished, runner) as opened:
+            yield rows, opened
 
 
-def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:
+def _remove_groups(format: ScenarioFormat[Any, Any], runner: Runner) -> None:
     """Remove the groups of a finished result, but not the groups of an unfinished longer run.
 
     A share that has ended leaves a lock file until all shares are joined: the groups may be of a longer run, too.
     """
     is_share = isinstance(runner, Share | Joining)
     has_shares = any(format.folder.glob(".lock.*-of-*")) and not is_share
-    if not has_shares and not format.has_other_groups({*scenario_ids}):
+    if not has_shares and not format.has_other_groups():
         remove_locks(format.folder / ".lock")
-        remove_folder(format.folder, format.file_names({*scenario_ids}))
+        remove_folder(format.folder, format.file_names())
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

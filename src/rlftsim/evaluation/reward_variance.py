@@ -132,7 +132,9 @@ def _measure_scenario(
     except DataError as error:
         return {"variances": [], "skipped": str(error)}
     # features once for all rollouts: subsets pick rows of them, which is what training would compute
-    features = compute_features(log, simulate_states(policy, collate([scenario]).to(device), config))
+    batch = collate([scenario]).to(device)
+    with torch.no_grad():
+        features = compute_features(log, simulate_states(policy, batch, config, context=policy.encode(batch)))
     score_subset = partial(_score_subset, log, features, config.metric)
     # by scenario: neither the order of the scenarios nor the number of processes changes the subsets
     rng = np.random.default_rng([config.seed, *scenario.scenario_id.encode()])

@@ -55,7 +55,7 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
         write_identity(out / ABOUT, identity)
         _check_identity(out, identity, is_alone=lease.is_alone)  # another share may have begun at the same moment
         task = partial(_simulate_scenario, simulation, out)
-        paths = run_items("simulate", simulation.scenario_ids, task, format=rollouts, lease=lease, runner=runner)
+        paths = run_items("simulate", simulation.scenario_ids, task, format=rollouts, lease=lease)
         remove_temporaries([out / ABOUT, *paths])  # of processes that were killed
         lease.remove()
     return paths

@@ -11,7 +11,7 @@ from rlftsim.evaluation.explain import explain
 from rlftsim.evaluation.explain_page import explanation_html, write_files
 from rlftsim.evaluation.exporters import animate_states
 from rlftsim.evaluation.results import Evaluation
-from rlftsim.evaluation.rollout_states import simulate_evaluated
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.runner import check_jobs, choose_runner
@@ -56,7 +56,7 @@ class EvaluatedModels:
             evaluation = self.evaluations[position]
             config = replace(evaluation.config, num_rollouts=ROLLOUTS_SHOWN)
             name = evaluation.name if evaluation.name not in states else f"{evaluation.name} ({position + 1})"
-            states[name] = simulate_evaluated(policy, collate([scenario]), config)
+            states[name] = simulate_states(policy, collate([scenario]), config)
         return animate_states(scenario, states, max_rollouts=ROLLOUTS_SHOWN, caption=caption)
 
 
@@ -107,6 +107,6 @@ def _write_scenario_file(models: EvaluatedModels, path: Path, item: tuple[str, i
         return
     assert models.dataset is not None
     evaluation, scenario = models.evaluations[position], models.dataset.by_id(scenario_id)
-    states = simulate_evaluated(models.policies[position], collate([scenario]), evaluation.config)
+    states = simulate_states(models.policies[position], collate([scenario]), evaluation.config)
     explanation = explain(scenario, states, metric_by_name(evaluation.config.metric))
     write_text(path, explanation_html(explanation, evaluation.name))

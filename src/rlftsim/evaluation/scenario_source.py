@@ -9,15 +9,21 @@ from pathlib import Path
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.wire_format import BYTES, iterate_fields
+from rlftsim.realism.map_based import select_polylines
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, dataset_folder
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, read_records
-from rlftsim.scenario.types import TOTAL_STEPS, Scenario
+from rlftsim.scenario.types import ROAD_EDGE_TYPES, TOTAL_STEPS, Scenario
 from rlftsim.scenario.womd import find_tfrecords, scenario_from_bytes
 
 _SCENARIO_ID_FIELD = 5
 _HEADER_BYTES = 12
 _CACHED_SCENARIOS = 2  # each is read once
+
+
+def has_road_edge(scenario: Scenario) -> bool:
+    """True if the map has a road edge of two points or more; else the official metric is undefined."""
+    return len(select_polylines(scenario.map_features, ROAD_EDGE_TYPES).count) > 0
 
 
 def open_held_out(

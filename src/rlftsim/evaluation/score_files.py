@@ -19,17 +19,16 @@ from rich.table import Table
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.columns import ARROWS, find_direction
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import make_evaluation
+from rlftsim.evaluation.resumable import open_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
-from rlftsim.evaluation.scenario_source import ScenarioSource, hash_source, open_scenarios
+from rlftsim.evaluation.scenario_source import ScenarioSource, has_road_edge, hash_source, open_scenarios
 from rlftsim.jobs.documents import to_finite
+from rlftsim.jobs.items import do_group, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
 from rlftsim.realism.config import is_reported, official_buckets, official_fields
-from rlftsim.realism.map_based import select_polylines
-from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
 
 _NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"
 
@@ -115,16 +114,17 @@ def score_rollouts(
         policy="rollouts from files",
         # of all, also under a limit: a quick look and the whole are of the same rollouts
         policy_fingerprint=hash_entries(all_entries),
-        dataset=str(scenarios.absolute()),
-        manifest_sha256=hash_source(source),
-        sources=source.sources,
-        guessed=source.guessed,
-    )
+        dataset=str(scenarios.absolute()), manifest_sha256=hash_source(source),
+        sources=source.sources, guessed=source.guessed,
+    )  # fmt: skip
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
     ids, work = [entry.scenario_id for entry in entries], partial(_score_entry, entries, source, config, num_rollouts)
-    result = make_evaluation(
-        "score", name, provenance, out, ids, work, runner=runner, jobs=config.num_jobs, show_progress=show_progress
-    )
+    with open_evaluation(name, provenance, out, ids, runner=runner, jobs=config.num_jobs) as (rows, result):
+        if not isinstance(result, Evaluation):
+            task = partial(do_group, work, rows)
+            result = rows.join(
+                run_items(f"score {name}", rows.groups, task, format=rows, lease=result, show_progress=show_progress)
+            )
     # The result may be a stored one, made under missing_map="skip".
     _check_maps(result.skipped, config)
     return result
@@ -234,11 +234,6 @@ def _score_entry(
         raise DataError(f"{entry}: {error}") from error
     warn_of_doubts(scenario, states, entry.file)
     return row_of_result(result, scenario, states, source.find_cluster(entry.scenario_id))
-
-
-def has_road_edge(scenario: Scenario) -> bool:
-    """True if the map has a road edge of two points or more; else the official metric is undefined."""
-    return len(select_polylines(scenario.map_features, ROAD_EDGE_TYPES).count) > 0
 
 
 def _check_maps(skipped: Sequence[Skipped], config: ScoreConfig) -> None:

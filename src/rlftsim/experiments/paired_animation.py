@@ -45,10 +45,11 @@ def animate_pair(
     """
     device = find_device(suite.device)
     log, batch = scenario_log(scenario, device), collate([scenario]).to(device)
-    features = {
-        name: compute_features(log, simulate_states(policy, batch, suite.evaluation))
-        for name, policy in policies.items()
-    }
+    with torch.no_grad():
+        features = {
+            name: compute_features(log, simulate_states(policy, batch, suite.evaluation, context=policy.encode(batch)))
+            for name, policy in policies.items()
+        }
     # Events: evaluated agents that collide at some step, plus those that leave the road at some step.
     base, tuned = (
         torch.stack([f.collision.any(-1), f.offroad.any(-1)]).sum(dim=(0, 2))  # [2, N, E] -> [N]

@@ -170,7 +170,7 @@ class Lease:
     """
 
     def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
-        self._path, self._doing, self._note = path, doing, note
+        self._path, self._doing, self._note, self.runner = path, doing, note, runner
         self._share = runner if isinstance(runner, Share) else None
         self._files: list[TextIO] = []
         check_begun(runner, path.parent)

@@ -4,9 +4,8 @@ An item may be done anywhere, and more than once: the same item always writes th
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
@@ -15,7 +14,7 @@ from rlftsim.jobs.files import check_result_file
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.processes import Advance, Task
 from rlftsim.jobs.progress import log, progress_bar
-from rlftsim.jobs.runner import Runner, check_finished, select_items
+from rlftsim.jobs.runner import check_finished, select_items
 from rlftsim.jobs.threads import one_thread
 
 Item = TypeVar("Item")
@@ -23,6 +22,10 @@ Result = TypeVar("Result")
 """Result of an item, as the work on the item returns it."""
 Stored = TypeVar("Stored")
 """Contents of a file, as they are read back."""
+
+
+class Stopped(Exception):
+    """The work is being stopped, after an error or Ctrl-C: the item at work is given up and leaves no file."""
 
 
 class ResultFormat(ABC, Generic[Item, Stored]):
@@ -125,31 +128,44 @@ def group_positions(num_items: int, items_per_file: int) -> list[range]:
     return [positions[start : start + items_per_file] for start in range(0, num_items, items_per_file)]
 
 
-def group_task(work: Callable[[int], Result], format: GroupFormat[Any, Result]) -> Task:
-    """Task that does the scenarios of a group in turn and writes the file of the group.
+def iterate_positions(group: range, advance: Advance, is_stopped: Callable[[], bool]) -> Iterator[int]:
+    """Positions of a group in turn, each reported as done when the next is asked for.
 
     Args:
-        work: Function from the position of a scenario to the result; must be picklable for other processes.
-        format: Files of the groups.
+        group: Positions of the scenarios of a group.
+        advance: Callback for the progress.
+        is_stopped: True once the work is being stopped; asked before each position.
+
+    Raises:
+        Stopped: `is_stopped` was true.
     """
-    return partial(_do_group, work, format)
+    for position in group:
+        if is_stopped():
+            raise Stopped
+        yield position
+        advance(1)
 
 
-def _do_group(
-    work: Callable[[int], Any],
-    format: GroupFormat[Any, Any],
+def do_group(
+    work: Callable[[int], Result],
+    format: GroupFormat[Any, Result],
     group: range,
     advance: Advance,
     is_stopped: Callable[[], bool],
 ) -> None:
-    results = []
-    for position in group:
-        # another process failed, or Ctrl-C: an unfinished group leaves no file
-        if is_stopped():
-            return
-        results.append(work(position))
-        advance(1)
-    format.write(group, results)
+    """Do the scenarios of a group in turn and write the file of the group: a `Task` with the first two bound.
+
+    Args:
+        work: Function from the position of a scenario to the result; must be picklable for other processes.
+        format: Files of the groups.
+        group: Positions of the scenarios of the group.
+        advance: Callback for the progress.
+        is_stopped: True once the work is being stopped.
+
+    Raises:
+        Stopped: `is_stopped` was true.
+    """
+    format.write(group, [work(position) for position in iterate_positions(group, advance, is_stopped)])
 
 
 def run_items(
@@ -159,7 +175,6 @@ def run_items(
     *,
     format: ResultFormat[Item, Stored],
     lease: Lease,
-    runner: Runner,
     unit: Literal["things", "bytes"] = "things",
     show_progress: bool = True,
 ) -> list[Stored]:
@@ -170,8 +185,7 @@ def run_items(
         items: Items over all shares, finished items included.
         task: Work on an item, which writes the file; the returned value is the result, and None reads the file back.
         format: Files of the results, in a folder that all processes see.
-        lease: Lock on that folder, which the shares of a run hold together.
-        runner: Runner of the items that are left; changes no result.
+        lease: Lock on that folder, which the shares of a run hold together, with the runner of the items.
         unit: Unit of the numbers beside the progress bar.
         show_progress: False prints neither progress nor the time left.
 
@@ -180,14 +194,14 @@ def run_items(
         Unfinished: The runner is a share, which is done, while other shares are not.
         NotYetError: Results are missing that other processes should have made, or that vanished meanwhile.
     """
-    selected = select_items(runner, range(len(items)))
+    selected = select_items(lease.runner, range(len(items)))
     pending = [number for number in selected if not format.is_finished(items[number])]
     total, num_pending = (sum(format.count_units(items[n]) for n in numbers) for numbers in (selected, pending))
     with progress_bar(title, total, total - num_pending, unit=unit, show=show_progress) as advance, one_thread():
-        made = runner.run(task, [items[n] for n in pending], advance=advance, describe=format.describe)
+        made = lease.runner.run(task, [items[n] for n in pending], advance=advance, describe=format.describe)
     lease.finish(title)
     # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
     results = {number: result for number, result in zip(pending, made) if result is not None}
     stored = [results[number] if number in results else format.read(item) for number, item in enumerate(items)]
-    check_finished(runner, sum(result is None for result in stored), len(items), title)
+    check_finished(lease.runner, sum(result is None for result in stored), len(items), title)
     return [result for result in stored if result is not None]

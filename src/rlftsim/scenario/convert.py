@@ -22,7 +22,7 @@ from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
 from rlftsim.jobs.documents import parse_json, read_json
 from rlftsim.jobs.files import check_result_file, remove_temporaries
 from rlftsim.jobs.folder import Lease, check_folder, check_name
-from rlftsim.jobs.items import ResultFormat, run_items
+from rlftsim.jobs.items import ResultFormat, Stopped, run_items
 from rlftsim.jobs.runner import Runner, check_finished, choose_runner, select_items, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
@@ -99,10 +99,6 @@ class _FinishedShard:
 
 _Outcome: TypeAlias = tuple[ShardEntry, bool | None]
 """A finished shard, and True if it is reused; None for a shard that another share has taken over or made."""
-
-
-class _Stopped(Exception):
-    """The run is being stopped; the shard is discarded."""
 
 
 class _Shards(ResultFormat[_Task, _Outcome]):
@@ -237,7 +233,7 @@ def convert(
         outcomes = run_items(
             "convert", [replace(task, finished=finished.get(task.shard)) for task in tasks],
             partial(_convert_unit, source=data_source),
-            format=_Shards(folder, data_source), lease=lease, runner=runner, unit="bytes", show_progress=show_progress,
+            format=_Shards(folder, data_source), lease=lease, unit="bytes", show_progress=show_progress,
         )  # fmt: skip
         num_changed = sum(not task.agrees(entry) for task, (entry, _) in zip(tasks, outcomes))
         check_finished(runner, num_changed, len(tasks), "convert")  # sources that changed meanwhile
@@ -303,7 +299,7 @@ def _convert_unit(
 
     Raises:
         DataError: Under "stop", a bad file or record; always: the shard cannot be written.
-        _Stopped: `is_stopped` was true.
+        Stopped: `is_stopped` was true.
     """
     # 1. Take over the shard of an earlier run if it is whole and made from these very files; remote ones are compared
     # by size alone, as their checksums would take as long as fetching them.
@@ -345,7 +341,7 @@ def _convert_unit(
                 case Tally():
                     tallies[item.event] += item.count
             if is_stopped():
-                raise _Stopped
+                raise Stopped
     # bytes between records, and all of them for a source that does not count
     advance(size - num_read)
 

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim.errors import DataError
-from rlftsim.evaluation.rollout_states import simulate_evaluated
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.jobs.files import errors_name, remove_folder, remove_temporaries, temporary_path, write_text
 from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.items import ResultFormat, run_items
@@ -97,10 +97,8 @@ def build_archive(
             remove_temporaries(outputs)
         receipts = _Receipts(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
         _forecast(job, sum(not receipts.is_finished(n) for n in select_items(runner, numbers)))
-        packed_shards = run_items(
-            "submit", numbers, partial(_build_shard, job),
-            format=receipts, lease=lease, runner=runner, show_progress=show_progress,
-        )  # fmt: skip
+        task = partial(_build_shard, job)
+        packed_shards = run_items("submit", numbers, task, format=receipts, lease=lease, show_progress=show_progress)
         remove_temporaries([*outputs, job.folder / PLAN])
         join_shards(archive, shards, packed_shards, delete=is_deleting)
         lease.remove()
@@ -154,7 +152,7 @@ def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[
 def _simulate_message(job: Job, position: int, shard: str) -> bytes:
     """Serialized rollouts of a scenario for the archive, checked."""
     scenario = job.data[position]
-    states = round_states(simulate_evaluated(job.policy, collate([scenario]), job.config), job.round_m)
+    states = round_states(simulate_states(job.policy, collate([scenario]), job.config), job.round_m)
     message = encode_rollouts(scenario.scenario_id, states, scenario.tracks.object_type[scenario.simulated_indices])
     for finding in check_rollouts(decode_rollouts(message), scenario, shard, job.config.challenge).findings:
         if finding.severity == "error":

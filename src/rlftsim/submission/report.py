@@ -16,8 +16,8 @@ from rich.table import Table
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import SCHEMA, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest
-from rlftsim.evaluation.score_files import format_scores, has_road_edge
+from rlftsim.evaluation.scenario_source import choose_scenarios, has_road_edge, hash_manifest
+from rlftsim.evaluation.score_files import format_scores
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.policies.checkpoint import read_card

@@ -15,7 +15,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.goals.types import logged_goals, read_goal_file, write_goal_file
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import Lease
-from rlftsim.jobs.items import GroupFormat, group_positions, group_task, read_stored, run_items
+from rlftsim.jobs.items import GroupFormat, do_group, group_positions, read_stored, run_items
 from rlftsim.jobs.runner import Inline, Runner
 from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
@@ -87,7 +87,7 @@ def augment_goals(
         RunFolder(folder, config, inputs)
         goals = _GoalFiles(folder, config.scenarios_per_part)
         groups, work = group_positions(len(scenarios), goals.size), partial(_find_ends, policy, scenarios, config)
-        paths = run_items("augment", groups, group_task(work, goals), format=goals, lease=lease, runner=runner)
+        paths = run_items("augment", groups, partial(do_group, work, goals), format=goals, lease=lease)
         remove_temporaries([folder / "config.json", folder / "environment.json", *paths])  # of killed processes
         lease.remove()
     return len(scenarios)

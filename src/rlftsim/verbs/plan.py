@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import ScenarioRows
-from rlftsim.evaluation.rollout_states import simulate_evaluated
+from rlftsim.evaluation.rollout_states import simulate_states
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
@@ -73,7 +73,7 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
         for position in [positions[0], *positions, int(np.argmax(agents))]:
             start = time.process_time()
             scenario = dataset[position]
-            states = simulate_evaluated(policy, collate([scenario]), config)
+            states = simulate_states(policy, collate([scenario]), config)
             if plan == "submit":
                 encode_rollouts(scenario.scenario_id, states)
             else:

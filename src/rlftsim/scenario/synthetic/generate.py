@@ -217,7 +217,7 @@ def generate(
     shards = folder / SHARDS
     with Lease(shards / ".lock", runner, "makes scenarios in") as lease:
         paths = run_items(
-            "synthetic scenarios", tasks, partial(_write_shard, shards), lease=lease, runner=runner,
+            "synthetic scenarios", tasks, partial(_write_shard, shards), lease=lease,
             format=WholeFiles(shards, attrgetter("shard_name"), ShardReader, attrgetter("num_scenarios")),
             show_progress=show_progress,
         )  # fmt: skip
