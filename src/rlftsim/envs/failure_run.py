@@ -4,7 +4,8 @@ An interrupted study goes on where it was, and a larger budget adds to a smaller
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,8 +20,7 @@ from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import check_folder, find_differences, write_identity
-from rlftsim.jobs.processes import Task
-from rlftsim.jobs.runner import Joining, Runner, Share
+from rlftsim.jobs.runner import Runner
 
 ABOUT = "failures.json"
 """Settings of the study in a folder."""
@@ -81,9 +81,9 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     ]  # fmt: skip
     names = [item.name for item in items]
     files = ScenarioValues(out / "repeats", names, dict.fromkeys(names, agreed), _read_round)
-    drive, telling = partial(_drive_round, config, items), _show_estimate(runner(len(items)), out / "repeats")
+    drive, note = partial(_drive_round, config, items), partial(_describe_estimate, out / "repeats", {})
     rounds: list[tuple[Repeat, ...] | str] = measure_scenarios(
-        f"failures of {config.planner}", drive, files, runner=telling
+        f"failures of {config.planner}", drive, files, runner=runner(len(items)), note=note
     )
     repeats: dict[str, list[Repeat]] = {pilot.scenario_id: [] for pilot in pilots}
     problems = {pilot.scenario_id: pilot.problem for pilot in all_pilots if pilot.problem}
@@ -155,38 +155,13 @@ def _build(cls: type[Value], values: Mapping[str, Any]) -> Value:
     return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in arguments.items()})
 
 
-def _show_estimate(runner: Runner, folder: Path) -> Runner:
-    """The same runner, whose progress shows the present estimate."""
-    if isinstance(runner, Share):
-        return replace(runner, runner=_Telling(runner.runner, folder))
-    return runner if isinstance(runner, Joining) else _Telling(runner, folder)
-
-
-@dataclass(frozen=True)
-class _Telling:
-    """A runner that shows the present estimate, from the files of finished repeats, beside the progress."""
-
-    runner: Runner
-    folder: Path
-    _probability: dict[str, float] = field(default_factory=dict)
-
-    def run(self, task: Task, items: Sequence[Any], *, advance: Any, describe: Callable[[Any], str] = str) -> list[Any]:
-        """Results of all items, see `Runner`."""
-
-        def tell(count: int = 1, note: str = "") -> None:
-            advance(count, note or self._describe())
-
-        return self.runner.run(task, items, advance=tell, describe=describe)
-
-    def _describe(self) -> str:
-        """Mean over the scenarios with a repeat."""
-        for path in self.folder.glob("*.json"):
-            if path.stem not in self._probability:
-                try:
-                    self._probability[path.stem] = float(read_json(path, "measure it again")["probability"])
-                except (DataError, OSError, KeyError, TypeError, ValueError):
-                    continue  # a damaged file is made again
-        of_scenario: dict[str, list[float]] = {}
-        for name, probability in self._probability.items():
-            of_scenario.setdefault(name.rpartition("-")[0], []).append(probability)
-        return f"P so far {np.mean([np.mean(p) for p in of_scenario.values()]):.2g}" if of_scenario else ""
+def _describe_estimate(folder: Path, probabilities: dict[str, float]) -> str:
+    """Mean over the scenarios with a repeat, from the files of finished repeats; `probabilities` has those read."""
+    for path in folder.glob("*.json"):
+        if path.stem not in probabilities:
+            with suppress(DataError, OSError, KeyError, TypeError, ValueError):  # a damaged file is made again
+                probabilities[path.stem] = float(read_json(path, "measure it again")["probability"])
+    of_scenario: dict[str, list[float]] = {}
+    for name, probability in probabilities.items():
+        of_scenario.setdefault(name.rpartition("-")[0], []).append(probability)
+    return f"P so far {np.mean([np.mean(p) for p in of_scenario.values()]):.2g}" if of_scenario else ""

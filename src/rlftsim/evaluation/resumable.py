@@ -216,6 +216,7 @@ def measure_scenarios(
     format: ScenarioValues[Stored],
     *,
     runner: Runner,
+    note: Callable[[], str] = str,
 ) -> list[Stored]:
     """Values of all scenarios, whose files stay in the folder: measured now, or read from there.
 
@@ -224,13 +225,15 @@ def measure_scenarios(
         work: Function from the position of a scenario to the values that are stored.
         format: Files of the scenarios.
         runner: Runner of the scenarios that are missing; changes no result.
+        note: Maker of the text beside the progress, see `run_items`.
 
     Raises:
         NotYetError: A second process at work in the folder.
         SetAside, Unfinished: See `run_items`.
     """
     with Lease(format.folder / ".lock", runner, "works in") as lease:
-        groups = run_items(title, format.groups, partial(do_group, work, format), format=format, lease=lease)
+        task = partial(do_group, work, format)
+        groups = run_items(title, format.groups, task, format=format, lease=lease, note=note)
         remove_temporaries(format.folder / name for name in format.file_names())
         lease.remove()
     return [stored for group in groups for stored in group]

@@ -176,6 +176,7 @@ def run_items(
     format: ResultFormat[Item, Stored],
     lease: Lease,
     unit: Literal["things", "bytes"] = "things",
+    note: Callable[[], str] = str,
     show_progress: bool = True,
 ) -> list[Stored]:
     """Results of all items, in the items' order, once all are done; the lease is then this process's alone.
@@ -187,6 +188,7 @@ def run_items(
         format: Files of the results, in a folder that all processes see.
         lease: Lock on that folder, which the shares of a run hold together, with the runner of the items.
         unit: Unit of the numbers beside the progress bar.
+        note: Maker of the text beside the progress, called after each step; the default makes an empty text.
         show_progress: False prints neither progress nor the time left.
 
     Raises:
@@ -198,7 +200,9 @@ def run_items(
     pending = [number for number in selected if not format.is_finished(items[number])]
     total, num_pending = (sum(format.count_units(items[n]) for n in numbers) for numbers in (selected, pending))
     with progress_bar(title, total, total - num_pending, unit=unit, show=show_progress) as advance, one_thread():
-        made = lease.runner.run(task, [items[n] for n in pending], advance=advance, describe=format.describe)
+        made = lease.runner.run(
+            task, [items[n] for n in pending], advance=lambda n: advance(n, note()), describe=format.describe
+        )
     lease.finish(title)
     # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
     results = {number: result for number, result in zip(pending, made) if result is not None}
