@@ -84,7 +84,7 @@ def test_nearest_map_tokens_are_those_of_all_tokens(vocabulary):
     scenario = torch.arange(200) % 2
     start = torch.randint(int(scene.tokens.token_mask.sum(1).min()), (200,), generator=generator)
     points = scene.tokens.position[scenario, start] + 8 * torch.randn(200, 2, generator=generator)
-    index, mask = scene.grid.find_nearest(points[:, None], scenario, 5)
+    index, mask = (values.mT for values in scene.grid.find_nearest(points[:, None], scenario, 5))
     positions = scene.tokens.position.masked_fill(~scene.tokens.token_mask[..., None], torch.inf)
     distance = (positions[scenario] - points[:, None]).norm(dim=-1)
     nearest = distance.topk(5, largest=False).values

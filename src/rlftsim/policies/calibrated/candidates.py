@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 from torch.nn import functional
 
-from rlftsim.geometry import heading_vector, rotate, wrap_angle
+from rlftsim.geometry import heading_vector, rotate, square_norm, wrap_angle
 from rlftsim.rollout.types import FARTHEST_STEP_M
 from rlftsim.scenario.batch import Frame, ScenarioBatch, compute_origin
 from rlftsim.scenario.polylines import arc_length, resample_to
@@ -102,12 +102,12 @@ class Segments:
         index = torch.cat(indices).sort(-1).values + (scenario * keys.shape[1])[:, None]  # [R, 4]
         # 2. the nearest of these; of two that are equally near, to the millimeter, always the first
         start, delta, direction = functional.embedding(index, self._table).split(2, -1)  # [R, 4, 2]
-        fraction = ((position[:, None] - start) * delta).sum(-1) / delta.square().sum(-1)
+        along = (position[:, None] - start) * delta
+        fraction = (along[..., 0] + along[..., 1]) / square_norm(delta)
         offset = start + fraction.clamp(0.0, 1.0)[..., None] * delta - position[:, None]
-        distance = offset.square().sum(-1)
+        distance = square_norm(offset)
         if heading is not None:
-            turned = direction - heading_vector(heading)[:, None]
-            distance = distance + METERS_PER_TURN**2 * turned.square().sum(-1)
+            distance = distance + METERS_PER_TURN**2 * square_norm(direction - heading_vector(heading)[:, None])
         nearest = (1e3 * distance.sqrt()).round().argmin(-1)[:, None, None].expand(-1, -1, 2)
         return offset.gather(1, nearest)[:, 0], direction.gather(1, nearest)[:, 0]
 
@@ -430,7 +430,7 @@ class Candidates:
     def _neighbors(self) -> "_Neighbors":
         """The nearest agents, in the agent's frame."""
         b, n, _, moment = self.agent_index
-        squared = self._relative.square().sum(-1).masked_fill(~self._is_distinct, torch.inf)
+        squared = square_norm(self._relative).masked_fill(~self._is_distinct, torch.inf)
         squared, index = squared.topk(min(MAX_NEIGHBORS, squared.shape[1]), largest=False)  # [R, O]
         neighbor = (b[:, None], n[:, None], index, moment[:, None])
         half_size = self.scene.size[b[:, None], index] / 2
@@ -457,5 +457,4 @@ class Candidates:
 
 
 def _is_near(offset: Float[Tensor, "*shape 2"], reach: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
-    x, y = offset.unbind(-1)
-    return x.square() + y.square() < reach.square()
+    return square_norm(offset) < reach.square()
