@@ -37,6 +37,12 @@ def test_the_shipped_tuned_model_is_more_realistic_than_its_base():
     assert np.mean(score("demo-tuned", 20)) > np.mean(score("demo-base", 20))
 
 
+def test_the_shipped_student_is_small_and_more_realistic_than_its_teachers_base():
+    # Measured 0.783 on these twenty; its teacher, demo-tuned, has 0.792, demo-base 0.761.
+    assert sum(weight.numel() for weight in rs.load_policy("demo-fast").parameters()) <= 65_000  # type: ignore[attr-defined]
+    assert np.mean(score("demo-fast", 20)) > np.mean(score("demo-base", 20))
+
+
 def test_shipped_weights_are_computed_with_in_float32():
     weights = list(rs.load_policy("demo-base").parameters())  # type: ignore[attr-defined]
     assert {weight.dtype for weight in weights} == {torch.float32}

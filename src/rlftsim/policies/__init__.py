@@ -8,6 +8,7 @@ SHIPPED_POLICIES = {
     "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
     "demo-base": "rlftsim.policies.shipped:demo_base",
     "demo-tuned": "rlftsim.policies.shipped:demo_tuned",
+    "demo-fast": "rlftsim.policies.shipped:demo_fast",
     "demo-goals": "rlftsim.policies.shipped:demo_goals",
     "trafficbots-base": "rlftsim.policies.shipped:trafficbots_base",
 }
