@@ -60,7 +60,9 @@ def main(
             seconds[name] += [pair] if seed else []
     agents = int(batch.agent_mask.sum()) * num_rollouts
     print(f"{agents} agents in all\n")
-    print("| model | encoding, s | rollouts, s | time to the first | agent steps/s | a decision, ms |\n|---|--:|--:|--:|--:|--:|")
+    print(
+        "| model | encoding, s | rollouts, s | time to the first | agent steps/s | a decision, ms |\n|---|--:|--:|--:|--:|--:|"
+    )
     first = [sum(values) for values in next(iter(seconds.values()))]
     for name, values in seconds.items():
         encoding, rollouts = (statistics.median(column) for column in zip(*values))
