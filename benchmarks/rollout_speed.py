@@ -17,6 +17,7 @@ from tyro.conf import Positional
 import rlftsim as rs
 from rlftsim.jobs.threads import keep_freed_memory
 from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.policy import frozen_copy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 
@@ -43,14 +44,14 @@ def main(
         models: Models, the calibrated ones with the base inside them.
         num_scenarios: The first so many.
         num_rollouts: Futures of each scenario.
-        repetitions: Counted ones; one more comes first.
+        repetitions: Counted ones, at least 1; one more comes first.
     """
     keep_freed_memory()  # as the command line does
     data = rs.load_dataset("synthetic", "validation")
-    batch = collate([data[index] for index in range(num_scenarios)])
+    batch = collate([data[index] for index in range(min(num_scenarios, len(data)))])
     policies = {}
     for model in models:
-        policy = load_policy(model).eval()
+        policy = frozen_copy(load_policy(model))
         policies |= {f"{model}, base": policy.base} if hasattr(policy, "base") else {}
         policies[model] = policy
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in policies}

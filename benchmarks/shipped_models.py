@@ -3,7 +3,8 @@
     python benchmarks/shipped_models.py WORK [--start MODEL] [--ship FOLDER]
 
 Every stage is a command, printed before it runs. All of them resume, so the same line goes on where it was stopped; two idle cores
-take about four hours, half of it for evaluations. `--ship src/rlftsim/policies/shipped` replaces the models of a checkout.
+take about five hours, half of it for evaluations. `--ship src/rlftsim/policies/shipped` replaces the models of a checkout.
+The cards of `demo-tuned` and `demo-fast` in the package have the exam's scores besides.
 """
 
 import shutil
@@ -19,6 +20,7 @@ from tyro.conf import Positional
 
 import rlftsim as rs
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_GOAL_COLUMNS, Column
+from rlftsim.policies.calibrated.policy import calibration_table, read_calibration
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Shipped:
     base: str | None = None
     """Model it is fine-tuned from: only weights that differ from that one's are stored."""
     teacher: str | None = None
-    """Model it is a student of, which the card compares it with."""
+    """Model it is a student of, which the card compares it with; its weights are all stored."""
     options: tuple[str, ...] = ()
     """Further words of its evaluation."""
     is_quick: bool = True
@@ -185,16 +187,15 @@ def ship(options: Options, name: str) -> Path:
     scores = table(evaluations, evaluations if reference is None else evaluate(options, reference))
     folder = (options.ship or options.work / "shipped") / name
     folder.mkdir(parents=True, exist_ok=True)
-    if (model / "calibration.json").exists():
-        shutil.copy(model / "calibration.json", folder)
-        model = model / "base"
-    weights = {k: v.half() for k, v in load_file(model / "model.safetensors").items()}
+    calibration = model / "calibration.json"
+    inner = "base/model.safetensors" if calibration.exists() else "model.safetensors"  # weights of the network
+    weights = {k: v.half() for k, v in load_file(model / inner).items()}
     if base is None:
-        save_file(weights, folder / "model.safetensors")
-        for file in ("config.json", "vocabulary.safetensors"):
-            if (model / file).exists():
-                shutil.copy(model / file, folder)
+        shutil.copytree(model, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.png"))
+        save_file(weights, folder / inner)
     else:
+        if calibration.exists():
+            shutil.copy(calibration, folder)
         before = {
             k: v.half() for k, v in load_file(options.work / "runs" / base / "model" / "model.safetensors").items()
         }
@@ -210,7 +211,8 @@ def ship(options: Options, name: str) -> Path:
         "Numbers on synthetic traffic say nothing about real traffic."
     )
     text = f"# {name}\n\n{MODELS[name].about} Weights: CC0-1.0. {command}.\n\n{note}\n\n"
-    (folder / "README.md").write_text(text + scores + "\n")
+    features = f"\n{calibration_table(read_calibration(calibration))}" if calibration.exists() else ""
+    (folder / "README.md").write_text(f"{text}{scores}\n{features}")
     return folder
 
 

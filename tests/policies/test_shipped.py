@@ -1,6 +1,7 @@
 """Models that ship with the package."""
 
 import functools
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import rlftsim as rs
 from rlftsim.errors import ConfigError
 from rlftsim.policies import shipped
 from rlftsim.policies.registry import POLICIES
+from rlftsim.rollout.fingerprint import fingerprint_policy
 
 FOLDER = Path(shipped.__file__).parent
 MOST_BYTES = 4 << 20
@@ -41,6 +43,12 @@ def test_the_shipped_student_is_small_and_more_realistic_than_its_teachers_base(
     # Measured 0.783 on these twenty; its teacher, demo-tuned, has 0.792, demo-base 0.761.
     assert sum(weight.numel() for weight in rs.load_policy("demo-fast").parameters()) <= 65_000  # type: ignore[attr-defined]
     assert np.mean(score("demo-fast", 20)) > np.mean(score("demo-base", 20))
+
+
+def test_a_copy_of_the_shipped_students_folder_is_the_same_model(tmp_path):
+    shutil.copytree(FOLDER / "demo-fast", tmp_path / "copy")
+    policies = rs.load_policy("demo-fast"), rs.load_policy(tmp_path / "copy")
+    assert len({fingerprint_policy(policy) for policy in policies}) == 1
 
 
 def test_shipped_weights_are_computed_with_in_float32():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import rlftsim as rs
 import tiny
 from catk_loss import catk_loss
 from rlftsim.errors import ConfigError
@@ -45,6 +46,13 @@ def test_with_one_candidate_it_is_a_greedy_rollout(policy, batch):
     for choice in ("closest", "top_k"):
         targeted = roll_out_closest(policy, batch, num_candidates=1, choice=choice)
         assert torch.equal(targeted.rollouts.decision, greedy.decision)
+
+
+@pytest.mark.parametrize("name", ["demo-tuned", "demo-fast"])
+def test_calibrated_models_and_students_keep_near_the_log(name):
+    policy, batch = rs.load_policy(name), collate([rs.load_dataset("synthetic", "validation")[0]])
+    near, greedy = (roll_out_closest(policy, batch, num_candidates=count).rollouts for count in (32, 1))
+    assert distance_from_log(batch, near) < 0.5 * distance_from_log(batch, greedy)
 
 
 def test_with_all_candidates_it_decides_as_it_should(policy, batch, vocabulary):

@@ -67,7 +67,9 @@ class DriveConfig:
         check_choice(self.scenarios, self.limit)
         for traffic in self.traffic or ("",):
             if traffic not in TRAFFIC:
-                raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
+                raise ConfigError(
+                    f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}: 'policy' is the model of --model."
+                )
         if len(set(self.traffic)) < len(self.traffic):
             raise ConfigError(f"traffic names a type twice: {', '.join(self.traffic)}.")
         if self.entries is not None and "policy" not in self.traffic:

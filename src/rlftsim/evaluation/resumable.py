@@ -272,7 +272,8 @@ def open_result(
         stored = find() if _stamp(path) != stamp else None
         yield lease if stored is None else stored
         # Only now: an interruption between the two leaves the groups, and the next call finds the result.
-        _remove_groups(format, runner)
+        if path.exists():
+            _remove_groups(format, runner)
 
 
 @contextmanager

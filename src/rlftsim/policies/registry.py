@@ -92,6 +92,8 @@ def _load(name: str | os.PathLike, device: Device, *extra_names: str) -> Policy:
         matches = difflib.get_close_matches(str(name), names, n=1)
         match = matches[0] if matches else find_similar_model(Path(name).expanduser())
         is_hub_id = re.fullmatch(r"\w[\w.-]*/[\w.-]+", str(name)) and not Path(name).parent.exists()
+        if match == str(name):
+            raise ConfigError(f"{match!r} is no folder: write one, rs.load_policy({match!r}).save_pretrained(FOLDER).")
         hint = f": did you mean {match!r}?" if match else f": on Hugging Face it is hf://{name}" if is_hub_id else "."
         raise ConfigError(f"{str(name)!r} is neither a model folder nor one of {', '.join(names)}{hint}")
     # A class has its instances' attributes, so a function that returns one would pass for a policy.

@@ -184,7 +184,7 @@ def finetune(
         CheckpointError: The folder holds another run, or the run diverged (the message names its last good checkpoint).
         NotYetError: Another run is at work in the folder.
     """
-    if seeds is not None:
+    if seeds is not None:  # first, while the locals are the arguments
         return repeat_for_seeds(finetune, locals(), seeds)
     if isinstance(config, PretrainConfig) or find_method(config) is None:
         check_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)

@@ -152,6 +152,16 @@ class State:
         """Draws in the state of the base."""
         return self.base.draws
 
+    @property
+    def position(self) -> Tensor:
+        """Positions [B, N, A, 2] before the decision."""
+        return self.traffic.position[..., 0, :]
+
+    @property
+    def heading(self) -> Tensor:
+        """Headings [B, N, A] before the decision."""
+        return self.traffic.heading[..., 0]
+
 
 class CalibratedPolicy(nn.Module):
     """A `TokenPolicy` with eta · f(state, token) added to the token logits.

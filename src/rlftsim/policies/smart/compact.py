@@ -47,6 +47,16 @@ class State:
     poses: Float[Tensor, "B N A 5 3"] | None = None
     draws: Tensor | None = None
 
+    @property
+    def position(self) -> Float[Tensor, "B N A 2"]:
+        """Positions before the decision, map frame."""
+        return self.steps.position
+
+    @property
+    def heading(self) -> Float[Tensor, "B N A"]:
+        """Headings before the decision, rad."""
+        return self.steps.heading
+
 
 class CompactPolicy(TokenModule):
     """Next-token traffic model of all agents of a scenario, with few weights, that follows no goals.
