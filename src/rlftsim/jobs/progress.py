@@ -99,7 +99,7 @@ def print_wide(*tables: Table) -> None:
 
 
 @runtime_checkable
-class Advance(Protocol):
+class ProgressUpdate(Protocol):
     """Callback of long work."""
 
     def __call__(self, count: int = 1, note: str = "") -> None:
@@ -115,7 +115,7 @@ class Advance(Protocol):
 @contextmanager
 def progress_bar(
     title: str, total: int, done: int = 0, *, unit: Literal["things", "bytes"] = "things", show: bool = True
-) -> Iterator[Advance]:
+) -> Iterator[ProgressUpdate]:
     """Show the progress of a piece of work; yields the function to call after each unit.
 
     Args:
@@ -143,7 +143,7 @@ def progress_bar(
         yield advance
 
 
-def _lines(title: str, total: int, done: int, show: bool) -> Advance:
+def _lines(title: str, total: int, done: int, show: bool) -> ProgressUpdate:
     """Progress without a terminal: a line every half minute and at the end."""
     start = last = time.monotonic()
     num_done = done
