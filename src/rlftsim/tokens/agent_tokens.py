@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
+from rlftsim.geometry import box_corners, pose_of_corners, rotate, square_norm, wrap_angle
 from rlftsim.scenario.batch import Frame, ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario, cached_on_scenario
 from rlftsim.tokens import catk_compat as catk_ops
@@ -336,7 +336,7 @@ def corner_distances(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "*n V 4
         table: Corners of V boxes in the same frame, m: the same V boxes for all of the n, or V for each.
     """
     # One corner at a time: [n, V] instead of [n, V, 4, 2] in memory.
-    total = sum((boxes[:, None, c] - table[..., c, :]).square().sum(-1).sqrt() for c in range(4))
+    total = sum(square_norm(boxes[:, None, c] - table[..., c, :]).sqrt() for c in range(4))
     return torch.as_tensor(total)
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.geometry import rotate
+from rlftsim.geometry import rotate, square_norm
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def find_neighbors(
     target = target.view(*lead, *[1] * extra, *target.shape[-2:])
     mask = target_mask.view(*lead, *[1] * extra, target_mask.shape[-1])
     offset = target[..., None, :, :2] - source[..., :, None, :2]  # [*g, S, M, 2]
-    distance = offset.square().sum(-1).sqrt().masked_fill(~mask[..., None, :], torch.inf)
+    distance = square_norm(offset).sqrt().masked_fill(~mask[..., None, :], torch.inf)
     nearest = distance.topk(min(count, distance.shape[-1]), dim=-1, largest=False, sorted=False)
     index = nearest.indices  # [*g, S, K]
     expanded = target[..., None, :, :].expand(*distance.shape, 3)
