@@ -4,7 +4,7 @@
     OMP_NUM_THREADS=1 python benchmarks/rollout_speed.py demo-fast --num-scenarios 1 --num-rollouts 4
 
 The same file runs on an older checkout. Prints a table of medians, with the least and greatest ratio to the first row.
-A decision is half a second of all agents of all scenarios and rollouts; maps and history are encoded before.
+A decision is that of all agents of all scenarios and rollouts; maps and history are encoded before.
 """
 
 import statistics
@@ -16,10 +16,12 @@ from tyro.conf import Positional
 
 import rlftsim as rs
 from rlftsim.jobs.threads import keep_freed_memory
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import frozen_copy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import FUTURE_STEPS
 
 
 def time_rollouts(policy: rs.Policy, batch: ScenarioBatch, num_rollouts: int, seed: int) -> tuple[float, float]:
@@ -52,7 +54,7 @@ def main(
     policies = {}
     for model in models:
         policy = frozen_copy(load_policy(model))
-        policies |= {f"{model}, base": policy.base} if hasattr(policy, "base") else {}
+        policies |= {f"{model}, base": policy.base} if isinstance(policy, CalibratedPolicy) else {}
         policies[model] = policy
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in policies}
     for seed in range(repetitions + 1):
@@ -69,7 +71,8 @@ def main(
         encoding, rollouts = (statistics.median(column) for column in zip(*values))
         ratios = sorted(sum(pair) / reference for pair, reference in zip(values, first))
         ratio = f"{statistics.median(ratios):.3f} ({ratios[0]:.3f} to {ratios[-1]:.3f})"
-        speed, decision = agents * 80 / (encoding + rollouts), 1e3 * rollouts / 16
+        speed = agents * FUTURE_STEPS / (encoding + rollouts)
+        decision = 1e3 * rollouts * policies[name].steps_per_decision / FUTURE_STEPS
         print(f"| {name} | {encoding:.2f} | {rollouts:.2f} | {ratio} | {speed:,.0f} | {decision:.2f} |")
 
 

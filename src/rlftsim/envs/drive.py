@@ -22,7 +22,6 @@ from rlftsim.evaluation.resumable import (
     read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.items import group_positions, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
@@ -134,7 +133,7 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     runner, find = choose_runner(config.jobs, len(ids)), partial(_read_finished, config, settings, ids, path)
 
     with open_result(path, files, find, runner) as opened:
-        if not isinstance(opened, Lease):
+        if isinstance(opened, DriveResult):
             return opened
         groups = group_positions(len(ids), config.count_side_by_side(settings.traffic, len(ids)))
         title = f"{config.planner} in {settings.traffic}"

@@ -56,9 +56,9 @@ def evaluate(
         ConfigError: An impossible name, a stored result of other work, several processes for a policy on a GPU, goals
             for a policy that is not goal-conditioned, or a limit that would replace a result of more scenarios.
     """
-    title = policy if isinstance(policy, str) else type(policy).__name__
-    fingerprint = policy if isinstance(policy, str) else fingerprint_policy(policy)
-    name = name or (title if title == fingerprint else f"{title}-{fingerprint[:8]}")
+    is_oracle = isinstance(policy, str)
+    title, fingerprint = ("oracle", "oracle") if is_oracle else (type(policy).__name__, fingerprint_policy(policy))
+    name = name or (title if is_oracle else f"{title}-{fingerprint[:8]}")
     if config.goals != "none" and not is_goal_conditioned(policy):
         raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
     if config.goals != "none" and config.challenge.makes_scenes:

@@ -45,7 +45,7 @@ def animate_pair(
     """
     device = find_device(suite.device)
     log, batch = scenario_log(scenario, device), collate([scenario]).to(device)
-    with torch.no_grad():
+    with torch.no_grad():  # from the logged history, whatever the metric: a context makes no scenes
         features = {
             name: compute_features(log, simulate_states(policy, batch, suite.evaluation, context=policy.encode(batch)))
             for name, policy in policies.items()

@@ -139,7 +139,7 @@ def pretrain(
         CheckpointError: The folder holds another run, or the run diverged.
         NotYetError: Another run is at work in the folder.
     """
-    if seeds is not None:
+    if seeds is not None:  # first, while the locals are the arguments
         return repeat_for_seeds(pretrain, locals(), seeds)
     check_config(config, "pretrain", PretrainConfig)
     training = to_scenarios(scenarios, split, limit)
