@@ -367,8 +367,9 @@ def prepare(options: Options, rows: Sequence[Row]) -> None:
         once("base", lambda: run_job(options, side, Job("prepare_base")))
     if options.womd and "evaluation" in rows:
         records = Job("prepare_evaluated", shared=str(options.womd / "validation"))
-        for one in options.sides(("new", "public")):
-            once(f"evaluated_{one}", lambda: run_job(options, one, records))  # noqa: B023
+        once("evaluated_new", lambda: run_job(options, "new", records))
+        if options.sides(("public",)):  # from the records of the line above
+            once("evaluated_public", lambda: run_job(options, "public", records))
 
 
 # ---- the report ----------------------------------------------------------------------------------------------------------
