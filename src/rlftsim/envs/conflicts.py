@@ -15,10 +15,11 @@ from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.envs.sumo_traffic import build_sumo_scene
 from rlftsim.geometry import wrapped
 from rlftsim.goals.lane_paths import sample_line
+from rlftsim.scenario.maneuver import VEHICLE_CONFLICTS
 from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
 
-FOLLOWING, MERGING, CROSSING, PEDESTRIAN = "following", "merging", "crossing", "pedestrian"
+(FOLLOWING, MERGING, CROSSING), PEDESTRIAN = VEHICLE_CONFLICTS, "pedestrian"
 HEADWAY_S, HORIZON_S = 2.0, 4.0
 LEAST_REACH_M = 20.0
 """Road users that stand may drive off: all look at least so far ahead."""
@@ -29,8 +30,6 @@ MEETS_M, WALKS_INTO_M = 1.5, 2.0
 SAME_PLACE_M = 3.0
 """A way that meets the ego's route within this distance of the ego's center comes from behind it."""
 MOVING_MPS = 0.5
-VEHICLE_CONFLICTS = frozenset({FOLLOWING, MERGING, CROSSING})
-"""Windows with any of these are the conflict windows."""
 
 
 def find_conflicts(scenario: Scenario, data: Path) -> frozenset[str]:

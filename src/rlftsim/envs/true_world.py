@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.envs.conflicts import VEHICLE_CONFLICTS
 from rlftsim.envs.planners.registry import hash_code
 from rlftsim.envs.true_world_episode import PLANNERS, Trip, read_row
 from rlftsim.envs.true_world_traffic import Surroundings, list_conflicts, load_model
@@ -26,6 +25,7 @@ from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.runner import Runner
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder
+from rlftsim.scenario.maneuver import VEHICLE_CONFLICTS
 from rlftsim.scenario.synthetic.worlds import find_window
 
 ROWS = "rows.parquet"
@@ -100,7 +100,7 @@ class TrueWorldConfig:
         ]  # fmt: skip
 
     def _has_conflict(self, window: tuple[str, str]) -> bool:
-        return not VEHICLE_CONFLICTS.isdisjoint(list_conflicts(self.data, window[0]))
+        return not list_conflicts(self.data, window[0]).isdisjoint(VEHICLE_CONFLICTS)
 
 
 def drive_true_world(config: TrueWorldConfig, out: Path, runner: Runner) -> pa.Table:

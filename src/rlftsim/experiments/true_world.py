@@ -20,6 +20,7 @@ from rlftsim.errors import DataError
 from rlftsim.experiments.results import format_origin
 from rlftsim.experiments.tables import TextTable
 from rlftsim.jobs.files import write_text
+from rlftsim.scenario.maneuver import VEHICLE_CONFLICTS
 from rlftsim.statistics import draw_clusters
 from rlftsim.training.run_folder import describe_environment
 from rlftsim.viewer.figure import COLORS, INK, save_figure
@@ -27,8 +28,6 @@ from rlftsim.viewer.figure import COLORS, INK, save_figure
 NUM_DRAWS = 2000
 CHANGED = 0.05
 """Episodes whose scores differ by more are counted."""
-VEHICLE_CONFLICTS = ("following", "merging", "crossing")
-"""In the rows; windows with any of these are the conflict windows."""
 DISTANCES_M = (0.0, 1.0, 5.0, 15.0, np.inf)
 REFERENCES = ("replay", "idm")
 

@@ -1,4 +1,4 @@
-"""Maneuvers: names of paths by the change of heading, for the index of a data set and for goal proposals."""
+"""Maneuvers: names of paths by the change of heading, for the index and for goal proposals; names of conflicts."""
 
 from enum import StrEnum
 
@@ -41,6 +41,8 @@ BENCHMARK_MANEUVERS = (
     *(Maneuver.LEFT_UTURN, Maneuver.LANE_CHANGE_LEFT, Maneuver.LANE_CHANGE_RIGHT),
 )
 """The six of the paper's maneuver benchmark, which goals are proposed for."""
+VEHICLE_CONFLICTS = ("following", "merging", "crossing")
+"""Conflicts of the ego with vehicles; windows with any of these are the conflict windows."""
 
 
 def classify_turn(turn_rad: float) -> Maneuver | None:
