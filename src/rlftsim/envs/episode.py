@@ -22,12 +22,10 @@ from rlftsim.envs.step_measures import measure_steps
 from rlftsim.envs.world import Dice, World, WorldState, begin, find_presence, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap
 from rlftsim.goals.types import PointById
-from rlftsim.realism.map_based import OUTSIDE_M, join_road_edges
+from rlftsim.realism.map_based import MAP_END_M, OUTSIDE_M, join_road_edges
 from rlftsim.scenario.types import FUTURE_STEPS
 
 AT_GOAL_M = 2.0
-MAP_END_M = 30.0
-"""The map has ended where no lane and no road edge is as near as this."""
 ScenarioGoals = Mapping[str, PointById]
 """Scenario id -> object id -> (x, y), world frame, m."""
 

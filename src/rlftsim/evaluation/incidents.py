@@ -13,15 +13,13 @@ from rlftsim.evaluation.drift import find_lane_points
 from rlftsim.evaluation.motion import LANE_HALF_WIDTH_M, MOVING_MPS, STRIDE, Motion, measure_gaps
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.features import DEFAULT_COMPUTE
-from rlftsim.realism.map_based import OUTSIDE_M, RoadEdges, build_road_edges, compute_distance_to_road_edge
+from rlftsim.realism.map_based import MAP_END_M, OUTSIDE_M, RoadEdges, build_road_edges, compute_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
 from rlftsim.scenario.types import HISTORY_STEPS, STEP_S, Scenario, cached_on_scenario
 
 LONGEST_STAND_S = 20.0
 FREE_WAY_M = 20.0
 """A vehicle with an agent or a red light so near ahead has a reason to stand."""
-OFF_MAP_M = 30.0
-"""An ego so far from every lane has left the map, as in an environment."""
 DEVICE = torch.device("cpu")
 MAX_PAIRS = DEFAULT_COMPUTE.pairs_on(DEVICE)
 
@@ -140,5 +138,5 @@ def count_steps_on_map(motion: Motion, scenario: Scenario) -> int:
     lanes, ego = find_lane_points(scenario), motion.position[motion.ego, ::STRIDE]
     if lanes is None:
         return motion.heading.shape[1]
-    is_off = lanes.tree.query(ego + scenario.origin)[0] > OFF_MAP_M
+    is_off = lanes.tree.query(ego + scenario.origin)[0] > MAP_END_M
     return int(is_off.argmax()) * STRIDE if is_off.any() else motion.heading.shape[1]

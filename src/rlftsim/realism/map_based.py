@@ -25,6 +25,8 @@ HEIGHT_STRETCH = 3.0
 """Factor on heights when the nearest road edge is chosen, so that agents below a bridge do not get its edge."""
 OUTSIDE_M = 0.3
 """A corner this far off the road leaves the drivable area, as in nuPlan."""
+MAP_END_M = 30.0
+"""The map has ended where no lane, and for a planner no road edge either, is as near as this."""
 CLOSED_SQUARED_M2 = 1.0
 """Polylines whose ends are nearer than this (squared, in space) are closed."""
 GROUP_STEPS = 8
