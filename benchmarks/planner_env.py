@@ -22,7 +22,7 @@ import torch
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv
 from rlftsim.envs.drive import drive
-from rlftsim.envs.drive_scenario import DriveConfig, make_environment
+from rlftsim.envs.drive_scenario import DriveConfig, load_source
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.evaluation.drive_results import compare_drives, format_drives
 from rlftsim.jobs.progress import print_wide
@@ -97,7 +97,7 @@ def speed(arguments):
 def steps(arguments):
     """CPU time of a step of `drive` in seconds 0 to 8 and 8 to 30."""
     config = DriveConfig("idm", data=arguments.data, model=arguments.model, seconds=30.0)
-    env, planner, seconds = make_environment(config, "policy"), load_planner("idm"), []
+    env, planner, seconds = EgoEnv(source=load_source(config, "policy")), load_planner("idm"), []
     for scenario in env.source.scenario_ids[: arguments.limit]:
         observation, info = env.reset(seed=0, options={"scenario": scenario})
         planner.reset(info)

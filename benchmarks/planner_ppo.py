@@ -20,8 +20,10 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from rlftsim.envs import EgoEnv
 from rlftsim.envs.driver_view import DriverView
 from rlftsim.envs.planner_episode import run_planner
-from rlftsim.envs.planners.registry import load_planner
+from rlftsim.envs.planner_scores import PlannerScores
+from rlftsim.envs.planners.registry import Planner, load_planner
 from rlftsim.envs.sb3 import SB3VecEnv
+from rlftsim.envs.source import Source
 from rlftsim.evaluation.compare import compare_paired
 
 PARTS = ("nuplan_style", "no_at_fault_collision", "drivable_area", "making_progress", "progress", "comfort")
@@ -104,6 +106,11 @@ def train(options: Options) -> PPO:
     return model
 
 
+def drive(source: Source, planner: Planner, scenario_id: str) -> PlannerScores:
+    (((result,), _),) = run_planner(source, planner, [source.scenario(scenario_id)], seed=0, rollouts=[0])
+    return result.planner
+
+
 def main(options: Options) -> None:
     torch.set_num_threads(1)
     planners = {"constant velocity": load_planner("constant_velocity"), "PPO": Trained(train(options))}
@@ -112,10 +119,7 @@ def main(options: Options) -> None:
             split="validation", data=options.held_out, traffic=traffic, action="bicycle", stop_on=(), reward="none"
         )
         ids = env.source.scenario_ids[: options.limit]
-        found = {
-            name: [run_planner(env, planner, env.source.scenario(i), seed=0).planner for i in ids]
-            for name, planner in planners.items()
-        }
+        found = {name: [drive(env.source, planner, i) for i in ids] for name, planner in planners.items()}
         for part in PARTS:
             before, after = (np.array([float(getattr(one, part)) for one in found[name]]) for name in planners)
             print(f"{traffic}: {compare_paired(part, before, after)}", flush=True)

@@ -50,7 +50,8 @@ def driven(name, scenario, **settings):
         stop_on=(),
         **{"traffic": "replay", **settings},
     )
-    return run_planner(env, planner, scenario, seed=0)
+    (((result,), _),) = run_planner(env.source, planner, [scenario], seed=0, rollouts=[0])
+    return result
 
 
 @pytest.mark.parametrize("name", ["idm", "pdm"])
@@ -151,8 +152,8 @@ def test_replay_in_is_the_log_out_on_real_scenarios(shared):
     for scenario in scenarios:
         planner = load_planner("replay")
         env = EgoEnv(scenarios=[scenario], traffic="replay", action="pose", stop_on=(), reward="none")
-        result = run_planner(env, planner, scenario, seed=0)
-        world, track = env.episode.world, np.stack(env.state.world.track, 2)  # [1, A, 91, 5]
+        (((result,), state),) = run_planner(env.source, planner, [scenario], seed=0, rollouts=[0])
+        world, track = env.source.episode([scenario]).world, np.stack(state.world.track, 2)  # [1, A, 91, 5]
         away = np.abs(track[..., :2] - world.logged[..., :2])[world.valid]
         assert away.max() < 1e-4
         assert result.planner.at_fault_collision_rate == 0.0
@@ -547,8 +548,12 @@ def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch, tmp_path
     rollouts = iter(["free", "blocked", "rammed"])
     movers = {"free": (), "blocked": (Mover(x_m=30.0, speed_mps=0.0),), "rammed": (Mover(x_m=-15.0, speed_mps=15.0),)}
     results = {name: driven("constant_velocity", build_scenario(name, (Mover(), *movers[name]))) for name in movers}
+
+    def drive_next(*_, **__):
+        return (([results[name]], None) for name in rollouts)
+
     for module in ("drive_scenario", "drive_films"):
-        monkeypatch.setattr(f"rlftsim.envs.{module}.run_planner", lambda *_, **__: results[next(rollouts)])
+        monkeypatch.setattr(f"rlftsim.envs.{module}.run_planner", drive_next)
     (row,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=3))
     assert row.values("blamed_others_rate")[0] == 0.5
     assert row.values("others_collision_rate")[0] == 0.0  # NaN where the planner is alone
@@ -789,9 +794,9 @@ def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatc
 
 
 def test_an_error_of_the_world_is_not_the_planners(monkeypatch):
-    def step(env, action):
+    def advance(*_):
         raise RuntimeError("a defect of ours")
 
-    monkeypatch.setattr(EgoEnv, "step", step)
+    monkeypatch.setattr("rlftsim.envs.planner_episode.advance", advance)
     with pytest.raises(RuntimeError, match="a defect of ours"):
         driven("idm", straight_road())

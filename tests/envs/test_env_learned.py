@@ -53,7 +53,7 @@ def test_the_file_drives_as_the_policy_in_memory(kind, tmp_path):
     planner = load_planner(f"sb3:{tmp_path}/ppo.zip")
     assert planner.action == KINDS[kind].get("action", "bicycle")
     env = EgoEnv(scenarios=[bend()], traffic="replay", action=planner.action, stop_on=())
-    result = run_planner(env, planner, bend(), seed=0)
+    (((result,), _),) = run_planner(env.source, planner, [bend()], seed=0, rollouts=[0])
     mirror = EgoEnv(scenarios=[bend()], traffic="replay", action=planner.action, observation=form, stop_on=())
     seen, over = mirror.reset(seed=0)[0], False
     while not over:

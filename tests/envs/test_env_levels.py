@@ -40,7 +40,8 @@ def ramp(*movers):
 def driven(name, scenario):
     planner = load_planner(name)
     env = EgoEnv(scenarios=[scenario], action=read_action_settings(planner)["action"], stop_on=(), traffic="replay")
-    return run_planner(env, planner, scenario, seed=0)
+    (((result,), _),) = run_planner(env.source, planner, [scenario], seed=0, rollouts=[0])
+    return result
 
 
 def pushed(scenario, speed=10.0, steps=80, **settings):

@@ -57,7 +57,9 @@ def drive_all(env, action=STILL, **options):
 def driven(scenario, name="idm", **settings):
     planner = load_planner(name)
     settings |= {"stop_on": (), "reward": "none", **read_action_settings(planner)}
-    return run_planner(EgoEnv(scenarios=[scenario], **settings), planner, scenario, seed=0)
+    source = EgoEnv(scenarios=[scenario], **settings).source
+    (((result,), _),) = run_planner(source, planner, [scenario], seed=0, rollouts=[0])
+    return result
 
 
 def test_a_world_that_the_policy_drives_alone_is_a_simulation_and_sees_the_later_lights(policy):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import rlftsim
-from rlftsim.envs.drive_scenario import ROW_SCORES, DriveConfig, drive_scenarios, make_environment
+from rlftsim.envs.drive_scenario import ROW_SCORES, DriveConfig, drive_scenarios, load_source
 from rlftsim.envs.planners.registry import hash_code
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
@@ -46,7 +46,7 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         DataError: no such data, a scenario that the planner cannot drive, or a folder that cannot be written to.
     """
     # everything that can be refused is refused before anything is driven
-    sources = [make_environment(config, traffic).source for traffic in config.traffic]
+    sources = [load_source(config, traffic) for traffic in config.traffic]
     ids = list(config.scenarios or sources[0].scenario_ids)[: config.limit]
     for scenario_id in ids:
         sources[0].scenario(scenario_id)

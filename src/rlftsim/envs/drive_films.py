@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from rlftsim.envs.drive_scenario import DriveConfig, make_environment
+from rlftsim.envs.drive_scenario import DriveConfig, load_source
 from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.result import build_animation
@@ -44,10 +44,11 @@ def write_film(config: DriveConfig, scenario_id: str, out: Path) -> Path:
     """
     records, scores = {}, []
     for traffic in config.traffic:
-        env = make_environment(config, traffic)
-        planner, scenario = load_planner(config.planner), env.source.scenario(scenario_id)
+        source, planner = load_source(config, traffic), load_planner(config.planner)
         rollouts = range(config.num_rollouts if config.film == "failures" else 1)
-        results = (run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in rollouts)
+        scenarios = [source.scenario(scenario_id)]
+        episodes = run_planner(source, planner, scenarios, seed=config.seed, rollouts=rollouts)
+        results = (result for (result,), _ in episodes)
         first = next(results)
         shown = first if is_failure(first.scores) else next((r for r in results if is_failure(r.scores)), first)
         records[f"{config.planner} in {traffic}"] = shown.record

@@ -11,8 +11,7 @@ import numpy as np
 
 from rlftsim.envs.config import MAX_STEPS, EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
-from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planner_episode import run_batch, run_planner
+from rlftsim.envs.planner_episode import run_planner
 from rlftsim.envs.planner_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.envs.planners.batch import acts_in_batches
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
@@ -102,15 +101,11 @@ def drive_scenarios(
     config: DriveConfig, traffic: str, ids: Sequence[str], positions: Sequence[int]
 ) -> list[dict[str, object]]:
     """Rows of scenarios that are driven side by side, and the scores that each scenario cannot give."""
-    env, planner = make_environment(config, traffic), load_planner(config.planner)
-    scenarios = [env.source.scenario(ids[position]) for position in positions]
-    rollouts, seed = range(config.num_rollouts), config.seed
+    source, planner = load_source(config, traffic), load_planner(config.planner)
+    scenarios = [source.scenario(ids[position]) for position in positions]
     try:
-        if acts_in_batches(planner):
-            results = list(run_batch(env.source, planner, scenarios, seed=seed, rollouts=rollouts))
-        else:
-            (scenario,) = scenarios
-            results = [[run_planner(env, planner, scenario, seed=seed, rollout=rollout)] for rollout in rollouts]
+        episodes = run_planner(source, planner, scenarios, seed=config.seed, rollouts=range(config.num_rollouts))
+        results = [rollout for rollout, _ in episodes]
     except EpisodeFailure as failure:
         if len(positions) > 1:  # the scenarios in which nothing fails have their scores
             log.warning(f"{failure} These scenarios are driven one by one.")
@@ -133,6 +128,6 @@ def _build_row(scenario_id: str, traffic: str, results: Sequence[Result]) -> dic
 
 
 @lru_cache(maxsize=8)
-def make_environment(config: DriveConfig, traffic: str) -> EgoEnv:
-    """Environment of a type of traffic, made once in each process."""
-    return EgoEnv(source=Source(config.settings(traffic)))
+def load_source(config: DriveConfig, traffic: str) -> Source:
+    """Scenarios and model of a type of traffic, loaded once in each process."""
+    return Source(config.settings(traffic))

@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.episode import advance, look, start
-from rlftsim.envs.planners.batch import BatchPlanner
+from rlftsim.envs.episode import EpisodeState, advance, look, start
+from rlftsim.envs.planners.batch import acts_in_batches
 from rlftsim.envs.planners.registry import Planner, guard_planner
 from rlftsim.envs.record import build_record
 from rlftsim.envs.resets import describe_start
@@ -18,46 +17,21 @@ from rlftsim.errors import ConfigError
 from rlftsim.scenario.types import Scenario
 
 
-def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
-    """Drive a scenario from the current step to the end.
-
-    Args:
-        env: Environment with the planner's type of action.
-        planner: Planner that drives, made by `load_planner`.
-        scenario: Scenario of the environment to drive to the end.
-        seed: Seed of the traffic; equal seeds, equal traffic for every planner.
-        rollout: Number of the rollout, 0 or more; each with dice of its own.
-
-    Raises:
-        EpisodeFailure: SUMO fails, or the planner raises an error, calls exit(), or wants what its type of action does
-            not allow.
-    """
-    observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
-        planner.reset(info)
-    while not env.state.ended[0]:
-        with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step):
-            action = planner.act(observation)
-        # of a step of the world only the action is the planner's
-        with guard_planner(planner, scenario.scenario_id, lambda: env.state.world.step, errors=(ConfigError,)):
-            observation, *_ = env.step(action)
-    return env.result()
-
-
-def run_batch(
-    source: Source, planner: BatchPlanner, scenarios: Sequence[Scenario], *, seed: int, rollouts: Iterable[int]
-) -> Iterator[list[Result]]:
-    """Drive scenarios side by side from the current step to the end; yields a result for each of them.
+def run_planner(
+    source: Source, planner: Planner, scenarios: Sequence[Scenario], *, seed: int, rollouts: Iterable[int]
+) -> Iterator[tuple[list[Result], EpisodeState]]:
+    """Drive scenarios side by side from the current step to the end; yields a result for each, and the last state.
 
     Args:
         source: Source of the scenarios, with the planner's type of action.
-        planner: Planner that drives all egos.
+        planner: Planner that drives all egos, made by `load_planner`; a single ego, unless the planner acts in batches.
         scenarios: Scenarios to drive to the end.
         seed: Seed of the traffic; equal seeds, equal traffic for every planner.
-        rollouts: Numbers of the rollouts, each with dice of its own.
+        rollouts: Numbers of the rollouts, 0 or more, each with dice of its own.
 
     Raises:
-        EpisodeFailure: SUMO fails, or the planner fails in any scenario.
+        EpisodeFailure: SUMO fails, or in any scenario the planner raises an error, calls exit(), or wants what its type
+            of action does not allow.
     """
     # scores see at the end who has left the road: no event is asked for
     episode = replace(source.episode(list(scenarios)), edges=None)
@@ -70,11 +44,16 @@ def run_batch(
                 planner.reset(describe_start(episode, state, row, source))
         while not state.ended.all():
             step = state.world.step
+            seen = {} if acts_in_batches(planner) else look(episode, state).of_agent(0)
             with guard_planner(planner, names, lambda now=step: now):
-                action = planner.act_batch(lambda now=state: look(episode, now).by_name())
+                if acts_in_batches(planner):
+                    action = planner.act_batch(lambda now=state: look(episode, now).by_name())
+                else:
+                    action = [planner.act(seen)]
+            # of a step of the world only the action is the planner's
             with guard_planner(planner, names, lambda now=step: now, errors=(ConfigError,)):
                 following, _ = advance(episode, state, action)
             steps[~state.ended] = following.world.step
             state = following
         # who has left the map stands there until the others have ended, which is not part of the episode
-        yield [Result(build_record(episode, state, row).first(int(steps[row]))) for row in rows]
+        yield [Result(build_record(episode, state, row).first(int(steps[row]))) for row in rows], state

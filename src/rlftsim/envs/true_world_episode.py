@@ -14,7 +14,7 @@ from rlftsim.envs.planner_scores import PlannerScores
 from rlftsim.envs.planners.registry import load_planner, read_action_settings
 from rlftsim.envs.result import Result
 from rlftsim.envs.sumo_traffic import SumoState
-from rlftsim.envs.true_world_traffic import Surroundings, list_conflicts, load_scenario, make_environment
+from rlftsim.envs.true_world_traffic import Surroundings, list_conflicts, load_scenario, load_source
 from rlftsim.errors import EpisodeFailure
 from rlftsim.jobs.progress import log
 from rlftsim.scenario.types import CURRENT_STEP
@@ -68,9 +68,9 @@ class Trip:
         """
         planner, scenario = load_planner(self.planner_name), load_scenario(self.data, self.window)
         settings = tuple(sorted(read_action_settings(planner).items()))
-        env = make_environment(self.data, self.window, self.surroundings, settings)
-        result = run_planner(env, planner, scenario, seed=self.seed, rollout=self.rollout)
-        return result, env.state.world.sumo_states
+        source = load_source(self.data, self.window, self.surroundings, settings)
+        (((result,), state),) = run_planner(source, planner, [scenario], seed=self.seed, rollouts=[self.rollout])
+        return result, state.world.sumo_states
 
     def drive(self) -> dict[str, object]:
         """Row of the episode; NaN where the planner fails, or SUMO."""

@@ -7,7 +7,6 @@ from typing import Any
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.conflicts import find_conflicts
 from rlftsim.envs.drivers import Traffic
-from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.episode import Episode, ScenarioGoals
 from rlftsim.envs.source import Source
 from rlftsim.errors import ConfigError, in_short
@@ -62,8 +61,8 @@ class _WorldSource(Source):
 
 
 @lru_cache(maxsize=2)
-def make_environment(data: str, window: str, surroundings: Surroundings, settings: tuple[Any, ...]) -> EgoEnv:
-    """Environment of a window, which planners with the same type of action share: encoding takes long.
+def load_source(data: str, window: str, surroundings: Surroundings, settings: tuple[Any, ...]) -> Source:
+    """Scenario and model of a window, which planners with the same type of action share: encoding takes long.
 
     Args:
         data: Data set with worlds.
@@ -78,7 +77,7 @@ def make_environment(data: str, window: str, surroundings: Surroundings, setting
     policy = load_model(surroundings.model) if surroundings.has_model else None
     source = _WorldSource(config, [load_scenario(data, window)], policy)
     source.ahead_m = surroundings.ahead_m
-    return EgoEnv(source=source)
+    return source
 
 
 load_model = lru_cache(maxsize=8)(load_policy)
