@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.idm import LOOKAHEAD_M, ON_LINE_M
 from rlftsim.envs.observations import FAR_M
+from rlftsim.goals.lane_paths import sample_line
 
 STRAIGHT_M = 80.0
 """Without a route a planner drives straight on."""
@@ -75,21 +76,14 @@ def _extend_routes(
     last /= np.maximum(np.linalg.norm(last, axis=-1, keepdims=True), 1e-6)
     beyond = points[row, end - 1] + LOOKAHEAD_M * last
     points = np.where((np.arange(points.shape[1]) < end[:, None])[..., None], points, beyond[:, None])
-    # 1. as `sample_line`: the segment that each full meter lies on
-    step = np.diff(points, axis=1)
-    distance = np.cumsum(np.linalg.norm(step, axis=-1), axis=1)  # [M, R] to the end of each segment
-    final = np.ceil(distance[:, -1] + 1e-6).astype(int) - 1
-    along = np.minimum(np.arange(final.max() + 1), final[:, None])  # [M, P]
-    segment = (distance[:, None] <= along[..., None]).sum(-1)
-    segment = np.minimum(segment, end[:, None] - 1)
-    start = np.pad(distance, ((0, 0), (1, 0)))
-    slope = step / np.maximum(np.diff(start, axis=1), 1e-9)[..., None]
-    rows = row[:, None]
-    rest = np.minimum(along, distance[:, -1:]) - start[rows, segment]
-    line = slope[rows, segment] * rest[..., None] + points[rows, segment]
+    # 1. points every meter, the last one repeated
+    lines = [sample_line(points[m, : end[m] + 1], 1.0) for m in row]
+    final = np.array(list(map(len, lines)))[:, None] - 1
+    along = np.arange(final.max() + 1)
+    line = np.stack([points[np.minimum(along, len(points) - 1)] for points in lines])
     # 2. directions to the next point
     turn = np.diff(line, axis=1)
-    turn = np.arctan2(turn[..., 1], turn[..., 0])[rows, np.minimum(np.arange(along.shape[1]), final[:, None] - 1)]
+    turn = np.arctan2(turn[..., 1], turn[..., 0])[row[:, None], np.minimum(along, final - 1)]
     return line, np.unwrap(turn)
 
 
