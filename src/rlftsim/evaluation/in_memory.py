@@ -48,7 +48,7 @@ def simulate_in_memory(
         ConfigError: Goals of a wrong type, frame, batch or number of rollouts, or without effect on the policy.
         DataError: A goal of an agent that is not simulated, a goal out of reach, or not two finite numbers.
     """
-    entry_model = None if entries is None else load_entries(entries)
+    entry_model = load_entries(entries)
     if entry_model is not None:
         batch = collate([add_visitors(scenario) for scenario in batch.scenarios], frame=batch.frame).to(batch.device)
     placed = _place_goals(goals, batch, num_rollouts)

@@ -42,8 +42,7 @@ def simulate_folder(simulation: Simulation, out: Path, *, runner: Runner) -> lis
         SetAside, Unfinished: See `run_items`.
     """
     check_length(simulation.policy, simulation.num_steps)
-    if simulation.entries is not None:
-        load_entries(simulation.entries)  # what cannot be read is refused before the folder is touched
+    if load_entries(simulation.entries) is not None:  # what cannot be read is refused before the folder is touched
         check_decisions(simulation.policy.steps_per_decision)
     check_sampling(simulation.policy, simulation.dataset, simulation.sampling)
     identity = simulation.describe()
@@ -80,14 +79,13 @@ def _simulate_scenario(
     """File with the rollouts of a scenario, written now; None where the work is being stopped."""
     if is_stopped():
         return None
-    scenario, name = simulation.dataset.by_id(scenario_id), simulation.entries
-    batch = collate([scenario if name is None else add_visitors(scenario)]).to(get_device(simulation.policy))
+    scenario, entries = simulation.dataset.by_id(scenario_id), load_entries(simulation.entries)
+    batch = collate([scenario if entries is None else add_visitors(scenario)]).to(get_device(simulation.policy))
     goal_entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
         num_steps=simulation.num_steps, sampling=simulation.sampling,
-        goals=goals_of_batch(goal_entries, batch) if goal_entries else None,
-        entries=None if name is None else load_entries(name),
+        goals=goals_of_batch(goal_entries, batch) if goal_entries else None, entries=entries,
     )  # fmt: skip
     [path] = write_rollouts(out, batch, rollouts)
     advance(1)

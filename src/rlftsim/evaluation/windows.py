@@ -211,7 +211,7 @@ def evaluate_windows(
                 f"{seconds:g} s against: rlftsim synthesize --seconds {seconds + 10:g} makes longer ones."
             )
     logs, rollouts, scenario_ids = [], [], list(list_scenario_ids(scenarios))
-    entry_model = None if entries is None else load_entries(entries)
+    entry_model = load_entries(entries)
     identity = {
         "policy": fingerprint_policy(policy), "worlds": hashlib.sha256("".join(scenario_ids).encode()).hexdigest()[:16],
         "rollouts": num_rollouts, "seed": seed, "temperature": sampling.temperature, "top_k": sampling.top_k or "",

@@ -266,8 +266,8 @@ ENTRIES: ExtensionPoint[EntryModel] = ExtensionPoint(
 """Name -> entry model."""
 
 
-def load_entries(name: str) -> EntryModel:
-    """The entry model of a name or of a file.
+def load_entries(name: str | None) -> EntryModel | None:
+    """The entry model of a name or of a file; None where nobody enters.
 
     Args:
         name: Registered name such as "fixed-rate", or a file that `rlftsim entries fit` wrote, FILE.npz.
@@ -276,6 +276,8 @@ def load_entries(name: str) -> EntryModel:
         ConfigError: An unknown name, with the nearest known one, or an object that is no entry model.
         DataError: A missing or damaged file.
     """
+    if name is None:
+        return None
     if name.endswith(".npz"):
         return _read_entries(name)
     if Path(name).is_file():
