@@ -10,6 +10,7 @@ import subprocess
 import sys
 import typing
 from dataclasses import replace
+from functools import wraps
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+import rlftsim as rs
 from rlftsim import __version__
 from rlftsim.cli.completion import SCRIPT
 from rlftsim.cli.main import VERBS, main, parse
@@ -417,6 +419,19 @@ def test_what_stops_a_verb_is_one_line(error, expected, line, capsys, monkeypatc
     status, _, err = run(capsys, "data", "stats", "synthetic")
     assert (status, err.strip().count("\n")) == (expected, 0)
     assert err.strip().startswith(line)
+
+
+def test_a_command_runs_what_others_have_put_around_a_verb(capsys, monkeypatch):
+    recipe, seen = rs.recipe, []
+
+    @wraps(recipe)
+    def watched(*arguments, **options):
+        seen.append(options)
+        return recipe(*arguments, **options)
+
+    monkeypatch.setattr("rlftsim.verbs.recipe.recipe", watched)
+    assert main(["recipe", "smart-demo"]) == 0
+    assert seen == [{"name": "smart-demo"}]
 
 
 def test_a_bug_keeps_its_traceback(capsys, monkeypatch):

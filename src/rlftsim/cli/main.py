@@ -5,7 +5,6 @@ Only the module of the verb is imported, and help texts do not import torch.
 
 import difflib
 import errno
-import inspect
 import io
 import os
 import signal
@@ -17,7 +16,7 @@ from rlftsim import __version__
 from rlftsim.errors import ConfigError, RlftsimError, find_package_error, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
-from rlftsim.verbs.commands import COMMANDS, VERBS
+from rlftsim.verbs.commands import COMMANDS, UNCHECKED, VERBS
 
 JOIN = "join"
 DEBUG = "--debug"
@@ -63,8 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(SCRIPT if words[1:] in (["bash"], ["zsh"]) else "\n".join(list_next_words(words[1:])))
             return 0
         call = parse(words)
-        # Unwrapped: the parser has checked names and numbers of the arguments.
-        return call.show(inspect.unwrap(call.command.function)(**call.arguments))
+        verb = call.command.function
+        # The parser has checked names and numbers of the arguments.
+        return call.show((UNCHECKED.get(verb) or verb)(**call.arguments))
     except RlftsimError as error:
         if shows_traceback:
             raise

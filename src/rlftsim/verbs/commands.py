@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
+UNCHECKED: dict[Callable[..., Any], Callable[..., Any]] = {}
+"""Function that checks names and numbers of arguments -> the function without the check."""
+
 
 @dataclass(frozen=True)
 class Command:

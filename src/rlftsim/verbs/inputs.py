@@ -23,6 +23,7 @@ from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import Name, open_dataset, to_scenarios
 from rlftsim.training.config import FinetuneConfig, PretrainConfig
+from rlftsim.verbs.commands import UNCHECKED
 
 Parameters = ParamSpec("Parameters")
 Returned = TypeVar("Returned")
@@ -52,6 +53,7 @@ def with_checked_arguments(function: Callable[Parameters, Returned]) -> Callable
             raise ConfigError(f"rs.{function.__name__}: {cause}: {way_out}") from None
         return function(*arguments, **options)
 
+    UNCHECKED[call] = function
     return call
 
 
