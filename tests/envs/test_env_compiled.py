@@ -39,6 +39,13 @@ def test_without_numba_environments_have_equal_bits():
     assert runs[0].stdout == runs[1].stdout != ""
 
 
+def test_without_numba_a_line_says_so_once():
+    code = "import sys; sys.modules['numba'] = None; import rlftsim.envs.ego_env, rlftsim.envs.road"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stderr.count("UserWarning") == run.stderr.count("pip install 'rlftsim[env]'.") == 1
+    assert "environments are many times slower without numba" in run.stderr
+
+
 def test_the_distance_to_the_road_edge_has_the_bits_of_the_metric():
     data, random = open_dataset("synthetic", "validation"), np.random.default_rng(0)
     maps = [data[i].map_features for i in range(4)]

@@ -1,11 +1,15 @@
 """Functions as machine code, by numba; without numba they run as they stand, with equal results but slowly."""
 
+import warnings
 from collections.abc import Callable
 
 try:
     from numba import njit
-except ImportError:
+except ImportError as error:
     njit = None
+    warnings.warn(
+        f"environments are many times slower without numba ({error}): pip install 'rlftsim[env]'.", stacklevel=2
+    )
 
 
 def compiled(function: Callable) -> Callable:
