@@ -110,6 +110,16 @@ def test_axe_finds_no_serious_violation(report, browser, barriers, scheme):
     page.close()
 
 
+@pytest.mark.parametrize(("scheme", "filters"), [("light", "none"), ("dark", "invert(0.9) hue-rotate(180deg)")])
+def test_a_picture_of_a_run_follows_the_page(browser, tmp_path, scheme, filters):
+    (tmp_path / "picture.png").write_bytes(b"")
+    page, loss = browser.new_page(color_scheme=scheme), Curve("loss", [0, 1], [2.0, 1.0])
+    charts = ChartGroup("Run", [Chart("Loss", "update", "nats", [loss])], "", tmp_path / "picture.png")
+    page.set_content(report_html(Report("Runs", chart_groups=[charts])))
+    assert page.evaluate("getComputedStyle(document.querySelector('img')).filter") == filters
+    page.close()
+
+
 def test_report_loads_nothing_from_elsewhere(report):
     html = report_html(report).replace(SVG_NAMESPACE, "")
     assert not re.search(r"<link|<img|<iframe|@import|\b(src|href)\s*=|url\(|https?://", html)
