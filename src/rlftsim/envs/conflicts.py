@@ -14,9 +14,8 @@ from rlftsim.envs.route import compute_headings, find_route
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.envs.sumo_traffic import build_sumo_scene
 from rlftsim.geometry import wrapped
-from rlftsim.goals.lane_paths import sample_line
 from rlftsim.scenario.maneuver import VEHICLE_CONFLICTS
-from rlftsim.scenario.polylines import arc_length
+from rlftsim.scenario.polylines import arc_length, sample_line
 from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
 
 (FOLLOWING, MERGING, CROSSING), PEDESTRIAN = VEHICLE_CONFLICTS, "pedestrian"

@@ -14,8 +14,7 @@ from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import NEAR_LANE_M, compute_headings, trace_lanes
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.geometry import heights_overlap, wrapped
-from rlftsim.goals.lane_paths import sample_line
-from rlftsim.scenario.polylines import arc_length, resample_to
+from rlftsim.scenario.polylines import arc_length, resample_to, sample_line
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
 
 LOOKAHEAD_M = 40

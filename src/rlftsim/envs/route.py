@@ -22,11 +22,10 @@ from rlftsim.goals.lane_paths import (
     lanes_for,
     own_lanes,
     paths_from,
-    sample_line,
 )
 from rlftsim.goals.proposals import CurrentAgent, propose_from_lanes
 from rlftsim.scenario.lane_graph import LaneGraph
-from rlftsim.scenario.polylines import arc_length
+from rlftsim.scenario.polylines import arc_length, sample_line
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, ObjectType, Scenario, cached_on_scenario
 
 SPACING_M = 2.0

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.geometry import wrapped
 from rlftsim.scenario.lane_graph import LaneGraph
-from rlftsim.scenario.polylines import arc_length
+from rlftsim.scenario.polylines import arc_length, sample_line
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, MapFeatureType, ObjectType
 
 CRUISE_MPS = {
@@ -282,18 +282,6 @@ def _resample(
     """A point every meter along a polyline, and the values there."""
     sampled = sample_line(np.column_stack([points, values]), SPACING_M)
     return sampled[:, :3], sampled[:, 3]
-
-
-def sample_line(line: Float[np.ndarray, "n k"], spacing_m: float) -> Float[np.ndarray, "m k"]:
-    """Points along a polyline from the start on.
-
-    Args:
-        line: Points of the polyline, at least two, m; columns after x and y are interpolated.
-        spacing_m: Distance from point to point along the line in the plane, m.
-    """
-    lengths = arc_length(line)
-    at = np.arange(0.0, lengths[-1] + 1e-6, spacing_m)
-    return np.stack([np.interp(at, lengths, column) for column in line.T], axis=1)
 
 
 def change_length_m(speed_mps: float) -> float:

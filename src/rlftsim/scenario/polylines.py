@@ -25,6 +25,18 @@ def resample_to(points: Float[np.ndarray, "n k"], count: int) -> Float[np.ndarra
     return np.stack([np.interp(at, distance, points[:, k]) for k in range(points.shape[1])], axis=1)
 
 
+def sample_line(line: Float[np.ndarray, "n k"], spacing_m: float) -> Float[np.ndarray, "m k"]:
+    """Points along a polyline from the start on.
+
+    Args:
+        line: Points of the polyline, at least two, m; columns after x and y are interpolated.
+        spacing_m: Distance from point to point along the line in the plane, m.
+    """
+    lengths = arc_length(line)
+    at = np.arange(0.0, lengths[-1] + 1e-6, spacing_m)
+    return np.stack([np.interp(at, lengths, column) for column in line.T], axis=1)
+
+
 def densify(points: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
     """Polyline of the same shape with further points between the given ones.
 

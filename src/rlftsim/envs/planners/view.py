@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.idm import LOOKAHEAD_M, ON_LINE_M
 from rlftsim.envs.observations import FAR_M
-from rlftsim.goals.lane_paths import sample_line
+from rlftsim.scenario.polylines import sample_line
 
 STRAIGHT_M = 80.0
 """Without a route a planner drives straight on."""
