@@ -4,7 +4,7 @@
 
 Every stage is a command, printed before it runs. All of them resume, so the same line goes on where it was stopped; two idle cores
 take about five hours, half of it for evaluations. `--ship src/rlftsim/policies/shipped` replaces the models of a checkout.
-The cards of `demo-tuned` and `demo-fast` in the package have the exam's scores besides.
+A model that comes out with the same bytes keeps its card: those of `demo-tuned` and `demo-fast` have the exam's scores besides.
 """
 
 import shutil
@@ -179,6 +179,11 @@ def _signed(column: Column, number: float) -> str:
     return f"{'+' if number > 0 else ''}{column.text(number)}"
 
 
+def read_files(folder: Path) -> dict[Path, bytes]:
+    """Contents of a model's files, without the card."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "README.md"}
+
+
 def ship(options: Options, name: str) -> Path:
     """Write a model with its card, weights in float16; returns its folder."""
     base, model = MODELS[name].base, options.work / "runs" / name / "model"
@@ -187,6 +192,8 @@ def ship(options: Options, name: str) -> Path:
     scores = table(evaluations, evaluations if reference is None else evaluate(options, reference))
     folder = (options.ship or options.work / "shipped") / name
     folder.mkdir(parents=True, exist_ok=True)
+    card, files_before = folder / "README.md", read_files(folder)
+    kept = card.read_text() if card.exists() else ""
     calibration = model / "calibration.json"
     inner = "base/model.safetensors" if calibration.exists() else "model.safetensors"  # weights of the network
     weights = {k: v.half() for k, v in load_file(model / inner).items()}
@@ -212,7 +219,7 @@ def ship(options: Options, name: str) -> Path:
     )
     text = f"# {name}\n\n{MODELS[name].about} Weights: CC0-1.0. {command}.\n\n{note}\n\n"
     features = f"\n{calibration_table(read_calibration(calibration))}" if calibration.exists() else ""
-    (folder / "README.md").write_text(f"{text}{scores}\n{features}")
+    card.write_text(kept if kept and read_files(folder) == files_before else f"{text}{scores}\n{features}")
     return folder
 
 
