@@ -18,7 +18,8 @@ from rlftsim.scenario.maneuver import VEHICLE_CONFLICTS
 from rlftsim.scenario.polylines import arc_length, sample_line
 from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, ObjectType, Scenario
 
-(FOLLOWING, MERGING, CROSSING), PEDESTRIAN = VEHICLE_CONFLICTS, "pedestrian"
+FOLLOWING, MERGING, CROSSING = VEHICLE_CONFLICTS
+PEDESTRIAN = "pedestrian"
 HEADWAY_S, HORIZON_S = 2.0, 4.0
 LEAST_REACH_M = 20.0
 """Road users that stand may drive off: all look at least so far ahead."""

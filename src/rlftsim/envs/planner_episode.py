@@ -44,14 +44,14 @@ def run_planner(
                 planner.reset(describe_start(episode, state, row, source))
         while not state.ended.all():
             step = state.world.step
-            seen = {} if acts_in_batches(planner) else look(episode, state).of_agent(0)
-            with guard_planner(planner, names, lambda now=step: now):
+            observation = {} if acts_in_batches(planner) else look(episode, state).of_agent(0)
+            with guard_planner(planner, names, lambda step=step: step):
                 if acts_in_batches(planner):
-                    action = planner.act_batch(lambda now=state: look(episode, now).by_name())
+                    action = planner.act_batch(lambda state=state: look(episode, state).by_name())
                 else:
-                    action = [planner.act(seen)]
+                    action = [planner.act(observation)]
             # of a step of the world only the action is the planner's
-            with guard_planner(planner, names, lambda now=step: now, errors=(ConfigError,)):
+            with guard_planner(planner, names, lambda step=step: step, errors=(ConfigError,)):
                 following, _ = advance(episode, state, action)
             steps[~state.ended] = following.world.step
             state = following
