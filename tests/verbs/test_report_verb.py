@@ -8,6 +8,7 @@ import pytest
 
 import rlftsim as rs
 from rlftsim.cli.main import main
+from rlftsim.errors import DataError
 from small_things import write_synthetic
 
 NAMES = ("constant_velocity", "demo-base", "oracle")
@@ -59,6 +60,19 @@ def test_all_models_are_in_the_table_and_against_the_first(page):
         assert words in page
     assert "Oracle against" not in page
     assert page.count("<canvas") == 2 * 3  # the log and two models: the scenario that gained most, and a middle one
+
+
+@pytest.mark.parametrize("options", [{"num_rollouts": 2}, {"metric": "2024"}])
+def test_the_score_of_the_log_is_of_the_same_rollouts_and_metric(folder, tmp_path, options):
+    oracle = rs.evaluate("oracle", folder / "data", limit=1, **{"num_rollouts": 4, **options})
+    with pytest.raises(DataError, match=f"oracle cannot be compared, {next(iter(options))} is"):
+        rs.report([folder / "constant_velocity.parquet", oracle], out=tmp_path)
+
+
+def test_a_row_of_fewer_scenarios_says_how_many(folder, tmp_path):
+    oracle = rs.evaluate("oracle", folder / "data", limit=1, num_rollouts=4)
+    page = rs.report([folder / "constant_velocity.parquet", oracle], out=tmp_path, num_listed=0).read_text()
+    assert "what a perfect simulator would score, scenarios: 1" in page
 
 
 def test_models_that_are_no_shipped_ones_are_named_and_recognized_by_their_weights(folder, tmp_path, capsys):

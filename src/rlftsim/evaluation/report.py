@@ -380,7 +380,9 @@ def build_report(
     """
     first, *others = models.evaluations
     judged = others[0] if others else first
-    compared = [compare(first, other) for other in others if other.provenance.policy != "oracle"]
+    # also the score of the log depends on metric and number of rollouts
+    compared = [compare(first, other) for other in others]
+    compared = [comparison for comparison in compared if comparison.b.provenance.policy != "oracle"]
     rows = rank_scenarios(models.evaluations)
     changed = sorted((row for row in rows if np.isfinite(row.change)), key=lambda row: -abs(row.change))
     changed = changed[:num_listed] if others else []
@@ -402,7 +404,7 @@ def build_report(
             ResultRow(
                 e.name,
                 {column.source: e.mean_and_error(column.source) for column in (*SCORES, *DRIFT_COLUMNS)},
-                NOTES.get(e.provenance.policy, ""),
+                _note_row(e, first),
                 emphasized=e is judged,
             )
             for e in models.evaluations
@@ -430,6 +432,12 @@ def build_report(
         if first.provenance.manifest_sha256 == hash_manifest(dataset_folder("synthetic"))
         else [],
     )
+
+
+def _note_row(evaluation: Evaluation, first: Evaluation) -> str:
+    """What the policy is, and the number of scenarios where it is not that of the first evaluation."""
+    count = f"scenarios: {len(evaluation)}" if len(evaluation) != len(first) else ""
+    return ", ".join(filter(None, [NOTES.get(evaluation.provenance.policy, ""), count]))
 
 
 def rank_scenarios(evaluations: Sequence[Evaluation]) -> list[ScenarioRow]:
