@@ -280,6 +280,14 @@ def without_agents(steps: slice, scenario_id: str = "padded") -> Scenario:
     return replace(whole, tracks=replace(whole.tracks, valid=valid))
 
 
+def without_ego(scenario_id: str = "no-ego") -> Scenario:
+    """The straight road with an ego that is not valid at the current step."""
+    whole = straight_road(scenario_id)
+    valid = whole.tracks.valid.copy()
+    valid[whole.ego_index, CURRENT_STEP] = False
+    return replace(whole, tracks=replace(whole.tracks, valid=valid))
+
+
 def without_road_edges(scenario_id: str = "no-edges") -> Scenario:
     """The straight road as in a log without road edges."""
     whole = straight_road(scenario_id)

@@ -31,7 +31,7 @@ class DataError(RlftsimError):
 
 
 class EpisodeFailure(DataError):
-    """An episode that cannot be driven to the end, by a fault of the planner or of the traffic."""
+    """An episode that cannot be driven to the end, by a fault of the planner, the traffic or the log."""
 
 
 class BadRecordError(DataError):

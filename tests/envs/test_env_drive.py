@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -39,7 +40,17 @@ from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.womd import find_tfrecords, read_scenarios
-from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, straight_road, without_future
+from scenes import (
+    NO_LIGHTS,
+    Mover,
+    bend,
+    build_scenario,
+    junction_map,
+    light,
+    straight_road,
+    without_ego,
+    without_future,
+)
 
 
 def driven(name, scenario, **settings):
@@ -498,6 +509,21 @@ def test_a_planner_that_fails_in_a_scenario_drives_the_others(tmp_path, monkeypa
     np.testing.assert_equal(result.values("progress")[[0, 2]], whole.values("progress")[[0, 2]])
     title = str(format_drive_comparison(compare_drives(whole, result)).title)
     assert title.endswith("2 scenarios in both, without 1 in which a planner failed")
+
+
+def test_an_ego_that_is_not_valid_now_costs_its_scenario_alone(tmp_path, capsys):
+    refused = "scenario no-ego: its ego, track 100, is not valid at the current step (10) and cannot be driven: leave"
+    with pytest.raises(DataError, match=re.escape(refused)):
+        EgoEnv(scenarios=[without_ego()], traffic="replay", split=None).reset()
+    write_dataset([straight_road("a"), without_ego(), straight_road("b")], tmp_path / "data", split="validation")
+    words = ["constant_velocity", "--data", str(tmp_path / "data"), "--traffic", "replay"]
+    assert main(["drive", *words, "--out", str(tmp_path / "drive")]) == 1
+    text = capsys.readouterr().out
+    assert refused in text
+    assert "failed in 1 of 3 scenarios, which the means leave out" in text
+    words += ["--particles", "2", "--budget", "16000", "--films", "0"]
+    assert main(["failures", *words, "--out", str(tmp_path / "failures")]) == 0
+    assert f"left out: {refused}" in capsys.readouterr().out
 
 
 def test_options_of_a_planner_are_written_behind_its_name(tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from rlftsim.scenario.shards import check_scenario
 from rlftsim.scenario.source import CONTRADICTORY
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
+from scenes import without_ego
 
 
 @pytest.fixture
@@ -164,6 +165,10 @@ def test_missing_map_and_no_agent_to_evaluate_are_found(make_dataset, make_messa
     empty = replace(whole, tracks=replace(whole.tracks, valid=np.zeros_like(whole.tracks.valid)))
     (finding,) = find_problems(empty)
     assert finding.detail == only_ego.replace("only the ego is evaluated", "nor is the ego: nothing is evaluated")
+    (finding,) = find_problems(without_ego())
+    assert str(finding) == (
+        "missing ego: no-ego: the ego (track 100) is not valid at the current step (10): no planner can drive it"
+    )
 
 
 def test_a_scenario_that_is_in_the_index_twice_is_found(make_dataset, make_message, monkeypatch):

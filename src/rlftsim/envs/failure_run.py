@@ -14,8 +14,7 @@ import numpy as np
 
 from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimate, Study, StudyConfig, share_budget
 from rlftsim.envs.failures import Failure, Repeat
-from rlftsim.envs.planners.registry import PlannerFailure
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, EpisodeFailure
 from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
@@ -52,7 +51,7 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
 
     Raises:
         ConfigError: A planner that cannot be copied, a budget that is too small, or the folder of another study.
-        DataError: The event holds at the start of every scenario.
+        DataError: In every scenario the event holds at the start, or the ego cannot be driven.
         SetAside, Unfinished: See `run_items`. Shares do the pilot first, and with the same command the repeats.
     """
     ids = config.scenario_ids()
@@ -107,7 +106,7 @@ def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict
     try:
         episodes.check_start()
         paths, danger = episodes.start(np.arange(config.pilot))
-    except PlannerFailure as error:  # other scenarios may be driven
+    except EpisodeFailure as error:  # other scenarios may be driven
         return asdict(Pilot(ids[position], (), 0.0, 0, str(error)))
     driven_m = float(np.mean([path.driven_m for path in paths]))
     worst = tuple(danger.max(1).tolist())
@@ -126,7 +125,7 @@ def _drive_round(config: StudyConfig, items: Sequence[_Round], position: int) ->
     episodes = config.chain(item.scenario_id, item.number)
     try:
         repeats = episodes.estimate(config.particles, REPEATS, is_branching=item.is_branching)
-    except PlannerFailure as error:  # without this repeat the estimate would be biased: the scenario is left out
+    except EpisodeFailure as error:  # without this repeat the estimate would be biased: the scenario is left out
         return {"probability": 0.0, "repeats": [], "problem": str(error)}
     return {"probability": float(np.mean([r.probability for r in repeats])), "repeats": [asdict(r) for r in repeats]}
 

@@ -30,8 +30,8 @@ def run_planner(
         rollouts: Numbers of the rollouts, 0 or more, each with dice of its own.
 
     Raises:
-        EpisodeFailure: SUMO fails, or in any scenario the planner raises an error, calls exit(), or wants what its type
-            of action does not allow.
+        EpisodeFailure: SUMO fails, an ego is not valid at the current step, or in any scenario the planner raises an
+            error, calls exit(), or wants what its type of action does not allow.
     """
     # scores see at the end who has left the road: no event is asked for
     episode = replace(source.episode(list(scenarios)), edges=None)

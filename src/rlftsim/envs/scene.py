@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.compiled import compiled
 from rlftsim.envs.levels import Levels, build_levels
+from rlftsim.errors import EpisodeFailure
 from rlftsim.scenario.lane_graph import LaneGraph, lane_graph
 from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import (
@@ -122,8 +123,16 @@ def build_env_scene(scenario: Scenario, num_steps: int) -> Scene:
     Args:
         scenario: Scenario with a log of any length.
         num_steps: Number S of steps of the log's time; the log is cut, or held at its end.
+
+    Raises:
+        EpisodeFailure: The ego is not valid at the current step.
     """
     tracks, rows, graph = scenario.tracks, scenario.simulated_indices, lane_graph(scenario)
+    if scenario.ego_index not in rows:
+        raise EpisodeFailure(
+            f"scenario {scenario.scenario_id}: its ego, track {tracks.object_id[scenario.ego_index]}, is not valid at "
+            f"the current step ({CURRENT_STEP}) and cannot be driven: leave the scenario out or name another ego."
+        )
     steps = slice(min(scenario.num_steps, num_steps))
     states = np.zeros((len(rows), num_steps, 6))
     states[:, steps, :2] = tracks.position[rows, steps, :2].astype(np.float64) - scenario.origin

@@ -52,6 +52,7 @@ class Problem(StrEnum):
     NOT_FINITE = "not finite"
     BROKEN = "broken scenario"
     NO_EVALUATED_AGENTS = "no evaluated agents"
+    MISSING_EGO = "missing ego"
 
     @property
     def is_damage(self) -> bool:
@@ -112,7 +113,7 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     types, sizes or track indices, NaN or infinite states or map points, positions too far from the origin for float32,
     a lane with two states at a step, velocities or headings that contradict the positions of most moving tracks,
     consecutive valid positions that imply more than 60 m/s, no lanes or no road edges, a map 200 m from the ego or
-    more, no agent to evaluate beside the ego.
+    more, no agent to evaluate beside the ego, an ego that is not valid at the current step.
 
     Args:
         folder: Folder of the data set, or "synthetic".
@@ -237,6 +238,10 @@ def find_problems(scenario: Scenario) -> Iterator[Finding]:
         consequence = "only the ego is evaluated" if has_ego else "nor is the ego: nothing is evaluated"
         detail = f"no track to predict is valid at the current step, {consequence}"
         yield Finding(Problem.NO_EVALUATED_AGENTS, scenario_id, detail)
+    elif not tracks.valid[scenario.ego_index, CURRENT_STEP]:
+        ego = f"the ego (track {tracks.object_id[scenario.ego_index]})"
+        detail = f"{ego} is not valid at the current step ({CURRENT_STEP}): no planner can drive it"
+        yield Finding(Problem.MISSING_EGO, scenario_id, detail)
 
 
 def _check_shard(path: Path, name: str, checked_ids: set[str]) -> Iterator[Finding]:
