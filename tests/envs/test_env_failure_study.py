@@ -1,6 +1,7 @@
 """Failures over many scenarios: the budget's shares, resuming to the same bytes, the page, and the command line."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,12 @@ def test_the_total_is_a_stratified_mean():
         1 - 0.05 ** (1 / 32)
     )
     assert math.isnan(Study(StudyConfig("idm"), (estimate(0.1), estimate(0.2, 0.3)), {}).mean_interval()[1])
+
+
+def test_the_total_of_a_planner_that_stands_still_has_no_rate_by_distance():
+    standing = replace(estimate(0.0, 0.0), pilot=replace(pilot([-1.0] * 4), driven_m=0.0))
+    text = Study(StudyConfig("idm"), (standing,), {}).describe_total()
+    assert text.endswith(" of idm: no rate per 1 000 km, as the planner stands still, fewer than 40.2 per hour")
 
 
 def test_a_planner_that_fails_after_the_pilot_loses_the_scenario_and_no_other(tmp_path, monkeypatch, capsys):

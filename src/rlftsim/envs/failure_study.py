@@ -215,13 +215,16 @@ class Study:
         return mean, mean * math.exp(-half), min(mean * math.exp(half) + hidden, 1.0)
 
     def describe_total(self) -> str:
-        """Events per 1 000 km and per hour driven, with interval."""
+        """Events per 1 000 km and per hour driven, with interval; of a planner that stands still per hour alone."""
         values, texts = self.mean_interval(), []
         # that an episode drives on average
         km = float(np.mean([s.pilot.driven_m for s in self.scenarios])) / 1000
         hours = load_source(self.config)[1].config.max_steps * STEP_S / 3600
         for unit, size in (("1 000 km", km / 1000), ("hour", hours)):
-            rate, low, high = (value / size if size else math.nan for value in values)
+            if not size:
+                texts.append(f"no rate per {unit}, as the planner stands still")
+                continue
+            rate, low, high = (value / size for value in values)
             interval = f" [{format_rate(low)}, {format_rate(high)}]" if math.isfinite(low) else ""
             texts.append(
                 f"{format_rate(rate)} per {unit}{interval}" if rate else f"fewer than {format_rate(high)} per {unit}"
