@@ -113,6 +113,21 @@ def test_a_planner_that_fails_after_the_pilot_loses_the_scenario_and_no_other(tm
     assert "per 1 000 km" in printed
 
 
+def test_a_smaller_study_never_replaces_a_larger_result(tmp_path, capsys):
+    words = ["failures", "constant_velocity", "--data", "synthetic", "--traffic", "replay", "--particles", "2"]
+    words += ["--films", "0", "--out", str(tmp_path)]
+    assert main([*words, "--limit", "2", "--budget", "8000"]) == 0
+    path, capture = tmp_path / "failures.parquet", capsys.readouterr
+    before = path.read_bytes()
+    capture()
+    assert main([*words, "--limit", "2", "--budget", "6000"]) == 2
+    assert f"6000 steps is too small for {path}, the result of 8000, which it would replace" in capture().err
+    assert main([*words, "--limit", "1", "--budget", "8000"]) == 2
+    assert f"{path} holds 2 scenarios, and limit=1 would replace them without 1 of these" in capture().err
+    assert path.read_bytes() == before
+    assert main([*words, "--limit", "2", "--budget", "9000"]) == 0
+
+
 @pytest.mark.slow
 def test_however_the_work_is_done_and_interrupted_the_bytes_are_the_same(tmp_path, capsys, monkeypatch):
     whole, shared = tmp_path / "whole", tmp_path / "shared"

@@ -1,6 +1,6 @@
 """Runs a study of failures: pilots, then repeats, as items of `jobs` with a file each.
 
-An interrupted study goes on where it was, and a larger budget adds to a smaller one.
+An interrupted study goes on where it was, and a larger budget adds to a smaller one, never the reverse.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,10 +12,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rlftsim.envs.failure_study import FAILURES, REPEATS, Pilot, ScenarioEstimate, Study, StudyConfig, share_budget
+from rlftsim.envs.failure_study import (
+    FAILURES,
+    REPEATS,
+    Pilot,
+    ScenarioEstimate,
+    Study,
+    StudyConfig,
+    load_source,
+    read_settings,
+    share_budget,
+)
 from rlftsim.envs.failures import Failure, Repeat
 from rlftsim.errors import ConfigError, DataError, EpisodeFailure
-from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
+from rlftsim.evaluation.resumable import ScenarioValues, check_scenarios_stay, measure_scenarios, read_finished
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
 from rlftsim.jobs.folder import check_folder, find_differences, write_identity
@@ -50,7 +60,8 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         runner: Maker of the runner of a number of items; changes no result.
 
     Raises:
-        ConfigError: A planner that cannot be copied, a budget that is too small, or the folder of another study.
+        ConfigError: A planner that cannot be copied, a budget that is too small, the folder of another study, or a
+            result of a larger budget or of further scenarios.
         DataError: In every scenario the event holds at the start, or the ego cannot be driven.
         SetAside, Unfinished: See `run_items`. Shares do the pilot first, and with the same command the repeats.
     """
@@ -61,6 +72,7 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     differences = find_differences(out / ABOUT, identity, "name another --out")
     if differences:
         raise ConfigError(f"{out} holds failures of another {', '.join(differences)}: name another --out.")
+    _check_result_stays(config, ids, out / FAILURES, budget)
     write_identity(out / ABOUT, identity)
     agreed = {"study": identity}  # in the file of each item
     # 1. the pilot
@@ -96,9 +108,25 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
         raise DataError(problems[pilots[0].scenario_id])
     estimates = [ScenarioEstimate(tuple(repeats[p.scenario_id]), config.particles, p) for p in measured]
     study = Study(config, tuple(estimates), problems)
-    study.write(out / FAILURES)
+    study.write(out / FAILURES, budget)
     remove_temporaries([out / ABOUT, out / FAILURES])  # of processes that were killed
     return study
+
+
+def _check_result_stays(config: StudyConfig, ids: Sequence[str], path: Path, budget: int) -> None:
+    """Check that a quick look with a smaller budget or fewer scenarios does not replace a result of the same study."""
+    if (stored := read_finished(path, read_settings)) is None:
+        return
+    finished, steps = stored
+    if budget < steps:
+        raise ConfigError(
+            f"a budget of {budget} steps is too small for {path}, the result of {steps}, which it would replace: give "
+            f"--budget {steps} or more, or name another --out."
+        )
+    finished_ids = list(finished.scenarios or load_source(config)[1].scenario_ids)[: finished.limit]
+    choice = f"limit={config.limit}" if config.limit is not None else "this choice"
+    way_out = "name another --out, or drive all scenarios."
+    check_scenarios_stay(path, len(finished_ids), len({*finished_ids} - {*ids}), choice, way_out)
 
 
 def _drive_pilot(config: StudyConfig, ids: Sequence[str], position: int) -> dict[str, object]:

@@ -11,7 +11,8 @@ steps at `STEPS_PER_S`.
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -40,6 +41,7 @@ from rlftsim.scenario.types import STEP_S
 STEPS_PER_S = 600
 """Steps that a second of a budget stands for: about what a core does."""
 FAILURES = "failures.parquet"
+WAY_OUT = "remove it and repeat `rlftsim failures`"
 REPEATS = 4
 """Estimates of a round, which run side by side."""
 NUMBERS_PER_ROUND = 1 << 24
@@ -232,10 +234,15 @@ class Study:
         note = "" if math.isfinite(values[1]) else "; without an interval: too few repeats"
         return f"{self.config.event} of {self.config.planner}: {', '.join(texts)}{note}"
 
-    def write(self, path: Path) -> None:
-        """Write the failing episodes as Parquet, a row each, with all that is needed to run them again."""
+    def write(self, path: Path, budget: int) -> None:
+        """Write the failing episodes as Parquet, a row each, with all that is needed to run them again.
+
+        Args:
+            path: File that a study of a smaller budget will not replace.
+            budget: Steps of all pilots and repeats.
+        """
         rows = [asdict(failure) for failure in self.failures]
-        about = json.dumps(asdict(self.config))
+        about = json.dumps({**asdict(self.config), "budget": budget})
         table = pa.Table.from_pylist(rows, schema=SCHEMA).replace_schema_metadata({"rlftsim": about})
         write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
@@ -252,6 +259,30 @@ SCHEMA = pa.schema({
 })  # fmt: skip
 
 
+@contextmanager
+def _errors_name_study(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (ConfigError, DataError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} is no table of failures ({first_line(error)}): {WAY_OUT}.") from None
+
+
+def read_settings(path: Path) -> tuple[StudyConfig, int]:
+    """Settings of a study that was written, and the steps of its budget; 0 where an older version wrote it.
+
+    Args:
+        path: File that `Study.write` wrote.
+
+    Raises:
+        DataError: A file that was cut or edited.
+    """
+    with _errors_name_study(path):
+        about = parse_json(read_parquet_metadata(path)[b"rlftsim"], WAY_OUT, source=str(path))
+        about["scenarios"] = about["scenarios"] and tuple(about["scenarios"])
+        budget = whole_number("budget", about.pop("budget", 0), 0)
+        return StudyConfig(**about), budget
+
+
 def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
     """A failing episode of a study that was written, and the study's settings.
 
@@ -262,18 +293,15 @@ def read_failure(folder: Path, number: int) -> tuple[StudyConfig, Failure]:
     Raises:
         DataError: No such study or row, or a file that was cut or edited.
     """
-    path, way_out = folder / FAILURES, "repeat `rlftsim failures`"
-    table = read_parquet(path, way_out, missing=f"{path} is not there: name the --out of `rlftsim failures`.")
+    path = folder / FAILURES
+    table = read_parquet(path, WAY_OUT, missing=f"{path} is not there: name the --out of `rlftsim failures`.")
     if not 0 <= number < len(table):
         raise DataError(f"{path} has {len(table)} failures, counted from 0: there is no number {number}.")
-    try:
-        about = parse_json(read_parquet_metadata(path)[b"rlftsim"], way_out, source=str(path))
-        about["scenarios"] = about["scenarios"] and tuple(about["scenarios"])
+    config, _ = read_settings(path)
+    with _errors_name_study(path):
         check_columns(table, SCHEMA)
         row = table.slice(number, 1).to_pylist()[0]
-        return StudyConfig(**about), Failure(**row | {"dice": tuple(row["dice"])})
-    except (ConfigError, DataError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{path} is no table of failures ({first_line(error)}): {way_out}.") from None
+        return config, Failure(**row | {"dice": tuple(row["dice"])})
 
 
 def share_budget(pilots: Sequence[Pilot], particles: int, budget: int) -> list[tuple[int, bool]]:
