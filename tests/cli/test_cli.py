@@ -599,7 +599,7 @@ def test_a_folder_of_other_rollouts_is_refused(tmp_path, capsys):
     assert run(capsys, *arguments, "--scenario", name)[0] == 0
     status, _, err = run(capsys, *arguments, "--seed", "1", "--scenario", name)
     assert status == 2
-    assert "holds rollouts of constant_velocity with another seed: name another --out" in err
+    assert "holds rollouts of constant_velocity with another seed (0, not 1): name another --out" in err
 
 
 def test_shares_of_different_settings_do_not_meet_in_a_folder(tmp_path, capsys):
@@ -608,7 +608,9 @@ def test_shares_of_different_settings_do_not_meet_in_a_folder(tmp_path, capsys):
     for path in tmp_path.glob("*.npz"):
         path.unlink()  # as before the first rollouts are made
     assert main([*words, "--out", str(tmp_path), "--share", "2/2", "--seed", "1"]) == 2
-    assert "was begun by a share for rollouts of constant_velocity with another seed" in capsys.readouterr().err
+    assert (
+        "was begun by a share for rollouts of constant_velocity with another seed (0, not 1)" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
@@ -809,7 +811,7 @@ def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, ca
     status, _, err = run(capsys, *arguments)
     assert (
         status,
-        "goal-seeker.parquet is the result of another goals: choose another --name" in err,
+        "goal-seeker.parquet is the result of another goals (logged, not none): choose another --name" in err,
     ) == (2, True)
     status, out, _ = run(capsys, *arguments, "--name", "free")
     assert (status, "missed" in out) == (0, False)

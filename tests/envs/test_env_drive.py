@@ -397,7 +397,9 @@ def test_a_drive_with_other_dice_is_not_replaced(tmp_path):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
     drive(config, tmp_path)
     before = (tmp_path / "constant_velocity-replay.parquet").read_bytes()
-    with pytest.raises(ConfigError, match=r"replay\.parquet is the result of another seed: choose another --out"):
+    with pytest.raises(
+        ConfigError, match=r"replay\.parquet is the result of another seed \(0, not 1\): choose another --out"
+    ):
         drive(replace(config, seed=1), tmp_path)
     assert (tmp_path / "constant_velocity-replay.parquet").read_bytes() == before
 

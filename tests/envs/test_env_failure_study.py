@@ -149,7 +149,7 @@ def test_however_the_work_is_done_and_interrupted_the_bytes_are_the_same(tmp_pat
     # 3. another study, and a smaller budget than one repeat needs
     capsys.readouterr()
     assert main([*LINE, "--out", str(whole), "--seed", "1"]) == 2
-    assert "holds failures of another seed" in capsys.readouterr().err
+    assert "holds failures of another seed (0, not 1)" in capsys.readouterr().err
     assert main([*LINE[:-1], "3000", "--out", str(whole)]) == 2
     assert "too small" in capsys.readouterr().err
     # 4. a failure again, in words and as a page

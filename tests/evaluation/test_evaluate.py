@@ -1,5 +1,6 @@
 import json
 import multiprocessing
+import re
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,7 +19,7 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
 from rlftsim.evaluation.resumable import ScenarioRows, open_evaluation
 from rlftsim.jobs.items import do_group, run_items
-from rlftsim.jobs.runner import Inline, Share, Unfinished
+from rlftsim.jobs.runner import Inline, Joining, Share, Unfinished
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.realism import score
@@ -213,7 +214,10 @@ def test_unfinished_parts_of_other_settings_outlive_a_repeated_command(data, tmp
 
 @pytest.mark.parametrize(
     ("policy", "config", "what"),
-    [(Wobble(strength_mps=2.0), CONFIG, "policy_fingerprint"), (Wobble(), replace(CONFIG, seed=1), "seed")],
+    [
+        (Wobble(strength_mps=2.0), CONFIG, r"policy_fingerprint \(\w{8}, not \w{8}\)"),
+        (Wobble(), replace(CONFIG, seed=1), r"seed \(0, not 1\)"),
+    ],
 )
 def test_a_result_of_another_policy_or_other_settings_is_not_replaced(data, tmp_path, policy, config, what):
     old = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
@@ -235,7 +239,21 @@ def test_parts_of_another_policy_are_replaced_with_a_message(data, tmp_path, cap
     parts = ScenarioRows("parts", old.provenance, tmp_path, old.scenario_ids)
     parts.write(range(0, 4), [dict(row) for row in old.table.slice(0, 4).to_pylist()])
     assert same(evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="parts"), expected)
-    assert "another policy_fingerprint: discarded" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert re.search(r"another policy_fingerprint \(\w{8}, not \w{8}\): it will be replaced", error)
+
+
+@pytest.mark.parametrize("runner", [Share(2, 2, Inline()), Joining()])
+def test_shares_of_other_settings_are_refused_with_both_values_and_stay(data, tmp_path, monkeypatch, runner):
+    with pytest.raises(Unfinished):
+        evaluate(Wobble(), data, tmp_path, CONFIG, name="w", runner=Share(1, 2, Inline()))
+    parts = {path: path.read_bytes() for path in (tmp_path / "w.parts").glob("*.parquet")}
+    monkeypatch.setattr(module, "simulate_states", None)  # nothing is simulated before
+    with pytest.raises(
+        ConfigError, match=r"another num_rollouts \(4, not 2\): shares need the same .* remove the folder"
+    ):
+        evaluate(Wobble(), data, tmp_path, replace(CONFIG, num_rollouts=2), name="w", runner=runner)
+    assert {path: path.read_bytes() for path in (tmp_path / "w.parts").glob("*.parquet")} == parts
 
 
 def test_a_damaged_part_is_made_again(data, tmp_path, capsys):

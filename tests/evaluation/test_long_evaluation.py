@@ -97,7 +97,9 @@ def test_who_drives_as_the_log_has_ratios_of_one(long_road, tmp_path):
     before = path.read_text()
     rs.evaluate("constant_velocity", [long_road], num_rollouts=2, rollouts_per_pass=1, seconds=20.0, out=tmp_path)
     assert path.read_text() == before
-    with pytest.raises(ConfigError, match=r"is the result of another rollouts, seed: name another --name"):
+    with pytest.raises(
+        ConfigError, match=r"is the result of another rollouts \(2, not 1\), seed \(0, not 1\): name another --name"
+    ):
         rs.evaluate("constant_velocity", [long_road], num_rollouts=1, seed=1, seconds=20.0, out=tmp_path)
     with pytest.raises(ConfigError, match="an evaluation's name becomes a file name"):
         rs.evaluate("constant_velocity", [long_road], name="../up", seconds=20.0, out=tmp_path)

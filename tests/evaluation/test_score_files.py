@@ -123,7 +123,9 @@ def test_scores_of_other_rollouts_are_not_replaced(data, rollouts, tmp_path):
     write_npz(folder / "a.npz", draw_arrays(SCENARIOS[0], seed=1))
     first = score_rollouts(folder, data, tmp_path / "out", CONFIG)
     write_npz(folder / "a.npz", draw_arrays(SCENARIOS[0], seed=2))
-    with pytest.raises(ConfigError, match="is the result of another policy_fingerprint: choose another"):
+    with pytest.raises(
+        ConfigError, match=r"is the result of another policy_fingerprint \(\w{8}, not \w{8}\): choose another"
+    ):
         score_rollouts(folder, data, tmp_path / "out", CONFIG)
     assert same(Evaluation.read(tmp_path / "out" / "rollouts.parquet"), first)
 

@@ -22,6 +22,7 @@ from rlftsim.evaluation.resumable import (
     read_finished,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
+from rlftsim.jobs.folder import describe_differences
 from rlftsim.jobs.items import group_positions, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
@@ -115,7 +116,9 @@ def _read_and_refuse(
     if result is not None:
         # a planner whose code has changed is driven anew, and so is one of an older version of this package
         differing = {*_differences(result.settings, settings)} - {"planner_code", "rlftsim_version"}
-        check_same_work(path, sorted(differing), "choose another --out")
+        stored, current = result.settings.what_counts(), settings.what_counts()
+        described = describe_differences({name: stored.get(name) for name in sorted(differing)}, current)
+        check_same_work(path, described, "choose another --out")
     return result
 
 

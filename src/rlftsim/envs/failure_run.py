@@ -28,7 +28,7 @@ from rlftsim.errors import ConfigError, DataError, EpisodeFailure
 from rlftsim.evaluation.resumable import ScenarioValues, check_scenarios_stay, measure_scenarios, read_finished
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries
-from rlftsim.jobs.folder import check_folder, find_differences, write_identity
+from rlftsim.jobs.folder import check_folder, describe_differences, find_differences, write_identity
 from rlftsim.jobs.runner import Runner
 
 ABOUT = "failures.json"
@@ -71,7 +71,8 @@ def run_study(config: StudyConfig, out: Path, budget: int, runner: Callable[[int
     identity = config.identity()
     differences = find_differences(out / ABOUT, identity, "name another --out")
     if differences:
-        raise ConfigError(f"{out} holds failures of another {', '.join(differences)}: name another --out.")
+        described = describe_differences(differences, identity)
+        raise ConfigError(f"{out} holds failures of another {described}: name another --out.")
     _check_result_stays(config, ids, out / FAILURES, budget)
     write_identity(out / ABOUT, identity)
     agreed = {"study": identity}  # in the file of each item

@@ -25,7 +25,7 @@ from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped
 from rlftsim.jobs.buckets import validate_folder
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import check_result_file, remove_folder, remove_temporaries, write_text
-from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
+from rlftsim.jobs.folder import Lease, check_folder, check_name, describe_differences, remove_locks
 from rlftsim.jobs.items import GroupFormat, Result, Stored, do_group, group_positions, read_stored, run_items
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Inline, Joining, Runner, Share, choose_runner
@@ -116,6 +116,8 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
     provenance: Provenance
     out: Path
     scenario_ids: Sequence[str]
+    is_shared: bool = False
+    """True refuses groups of other settings, which another share may be at; else they are replaced."""
 
     items_per_file: ClassVar[int] = 4
 
@@ -150,11 +152,16 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         rows = read_stored(self._path(item), Evaluation.read)
         if rows is None:
             return None
-        differences = rows.provenance.differences(self.provenance)
-        if _count_scenarios(rows).total() != len(item):
-            differences.append("number of scenarios")
+        differences = self._describe_differences(rows)
+        if differences and self.is_shared:
+            raise ConfigError(
+                f"{self._path(item)} is of another {differences}: shares need the same options, choose another --name "
+                f"or --out, or remove the folder {self.folder.name}."
+            )
+        if not differences and _count_scenarios(rows).total() != len(item):
+            differences = "number of scenarios"
         if differences:
-            log.info(f"{self._path(item)} is of another {', '.join(differences)}: discarded.")
+            log.info(f"{self._path(item)} is of another {differences}: it will be replaced.")
         return None if differences else rows
 
     def join(self, groups: Sequence[Evaluation]) -> Evaluation:
@@ -186,9 +193,14 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         if differences == ["rlftsim_version"]:
             log.info(f"{self.result_path} is of another version's numbers: it will be replaced.")
             return None
-        check_same_work(self.result_path, differences, "choose another --name or --out")
+        check_same_work(self.result_path, self._describe_differences(stored), "choose another --name or --out")
         # counted: a scenario may have several sets of rollouts in files, and one by a policy
         return stored if counts == Counter(self.scenario_ids) else None
+
+    def _describe_differences(self, stored: Evaluation) -> str:
+        values, current = stored.provenance.what_counts(), self.provenance.what_counts()
+        names = stored.provenance.differences(self.provenance)
+        return describe_differences({name: values.get(name) for name in names}, current)
 
     def file_names(self) -> list[str]:
         """Names of groups of any size, see `ScenarioFormat`."""
@@ -298,7 +310,7 @@ def open_evaluation(
 
     Raises:
         ConfigError: A name that no file can have, a stored result of other work, a limit that would leave out stored
-            scenarios, or shares without a folder to meet in.
+            scenarios, shares of other settings, or shares without a folder to meet in.
         DataError: A second driver at work on this evaluation.
     """
     runner = runner or choose_runner(jobs, math.ceil(len(scenario_ids) / ScenarioRows.items_per_file))
@@ -306,8 +318,13 @@ def open_evaluation(
         raise ConfigError("shares meet in a folder: name one with --out.")
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
     with tempfile.TemporaryDirectory() as temporary_folder:
-        rows = ScenarioRows(name, provenance, validate_folder(temporary_folder if out is None else out), scenario_ids)
+        folder = validate_folder(temporary_folder if out is None else out)
+        is_shared = isinstance(runner, Share | Joining)
+        rows = ScenarioRows(name, provenance, folder, scenario_ids, is_shared)
         with open_result(rows.result_path, rows, rows.read_finished, runner) as opened:
+            # groups of other shares, too: what cannot be joined is refused before hours of work
+            for group in rows.groups if is_shared and isinstance(opened, Lease) else ():
+                rows.read(group)
             yield rows, opened
 
 
@@ -331,19 +348,19 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def check_same_work(path: Path, differences: Sequence[str], way_out: str) -> None:
+def check_same_work(path: Path, differences: str, way_out: str) -> None:
     """Check that a stored result is not of other work, which the new result would replace.
 
     Args:
         path: File of the stored result.
-        differences: Names of the values that count and differ, such as the policy's fingerprint.
+        differences: Values that count and differ, see `describe_differences`; empty without any.
         way_out: Flags that keep the two apart, for the message.
 
     Raises:
         ConfigError: Any difference.
     """
     if differences:
-        raise ConfigError(f"{path} is the result of another {', '.join(differences)}: {way_out}, or remove the file.")
+        raise ConfigError(f"{path} is the result of another {differences}: {way_out}, or remove the file.")
 
 
 def check_scenarios_stay(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:

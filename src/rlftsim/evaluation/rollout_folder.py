@@ -13,7 +13,7 @@ from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.evaluation.simulation import Simulation
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.jobs.files import remove_temporaries
-from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
+from rlftsim.jobs.folder import Lease, check_folder, describe_differences, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Runner
 from rlftsim.rollout.entries import load_entries
@@ -113,4 +113,5 @@ def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool
     model = differences.pop("model", identity["model"])
     if differences and (rollouts or not is_alone):
         begun = "holds" if rollouts else "was begun by a share for"
-        raise ConfigError(f"{folder} {begun} rollouts of {model} with another {', '.join(differences)}: {way_out}.")
+        described = describe_differences(differences, identity)
+        raise ConfigError(f"{folder} {begun} rollouts of {model} with another {described}: {way_out}.")

@@ -20,7 +20,7 @@ from rlftsim.evaluation.incidents import Incidents, count_steps_on_map, find_inc
 from rlftsim.evaluation.motion import MOVING_MPS, STRIDE, Motion, find_collisions, measure_gaps, read_log, read_rollouts
 from rlftsim.evaluation.resumable import check_same_work
 from rlftsim.jobs.files import write_text
-from rlftsim.jobs.folder import check_name
+from rlftsim.jobs.folder import check_name, describe_differences
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.entries import identify_entries, load_entries
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -118,8 +118,8 @@ def _check_path(path: Path, identity: Mapping[str, object]) -> None:
                 stored = next(csv.DictReader(file), {})
         except csv.Error:
             stored = {}  # none of ours
-        differences = [name for name, value in identity.items() if stored.get(name) != str(value)]
-        check_same_work(path, differences, "name another --name")
+        differences = {name: stored.get(name) for name, value in identity.items() if stored.get(name) != str(value)}
+        check_same_work(path, describe_differences(differences, identity), "name another --name")
 
 
 def _summarize(samples: WindowSamples, log: WindowSamples) -> dict[str, float]:

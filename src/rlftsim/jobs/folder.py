@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, TextIO
 
-from rlftsim.errors import ConfigError, DataError, NotYetError, in_short
+from rlftsim.errors import MAX_VALUE, ConfigError, DataError, NotYetError, in_short, shorten
 from rlftsim.jobs.documents import MAX_NAME_BYTES, read_json
 from rlftsim.jobs.files import check_result_file, describe_type, errors_name, write_text
 from rlftsim.jobs.runner import Runner, Share, Unfinished, check_begun
@@ -48,6 +48,7 @@ SECONDS_TO_WAIT = 10.0
 """A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
 WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 """Errors of file systems that have no locks, such as Lustre mounted without `flock`."""
+_CHECKSUM = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{8,}\b")
 _OWNER = re.compile(r"^\S+ process \d+ since \d{4}-", re.MULTILINE)
 """Beginning of the line that `describe_owner` writes. Shares write into one file, so others may precede or follow."""
 
@@ -137,6 +138,23 @@ def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> di
     check_result_file(path)
     stored = read_json(path, remedy) if path.exists() else identity
     return {name: stored.get(name) for name in {**identity, **stored} if stored.get(name) != identity.get(name)}
+
+
+def describe_differences(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str:
+    """Stored values that differ from those of this work, for a message: "seed (0, not 1)"; empty without any.
+
+    Args:
+        stored: Differing values by name, see `find_differences`.
+        current: Values of this work by name.
+    """
+    return ", ".join(
+        f"{name} ({_describe_value(value)}, not {_describe_value(current.get(name))})" for name, value in stored.items()
+    )
+
+
+def _describe_value(value: object) -> str:
+    """A value in short, of checksums the beginning."""
+    return "none" if value in (None, "") else _CHECKSUM.sub(r"\1", shorten(str(value), MAX_VALUE))
 
 
 def write_identity(path: Path, identity: Mapping[str, Any]) -> None:

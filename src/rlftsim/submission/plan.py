@@ -12,7 +12,7 @@ import numpy as np
 from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.folder import find_differences, write_identity
+from rlftsim.jobs.folder import describe_differences, find_differences, write_identity
 from rlftsim.realism import SIM_AGENTS, Challenge
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy
@@ -60,7 +60,8 @@ class Plan:
         values = {**self.identity, "shards": [[shard.start, shard.stop] for shard in self.shards]}
         if differences := find_differences(path, values, "name another --out, or remove the folder"):
             raise ConfigError(
-                f"{folder} holds a submission of another {', '.join(differences)}: name another --out, or remove it."
+                f"{folder} holds a submission of another {describe_differences(differences, values)}: name another "
+                "--out, or remove it."
             )
         if not path.exists():
             write_identity(path, values)
