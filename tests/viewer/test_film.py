@@ -1,6 +1,10 @@
 """Scenes as films."""
 
+import os
+import signal
+import threading
 from dataclasses import replace
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -11,7 +15,7 @@ from PIL import Image
 import rlftsim as rs
 import scenes
 from rlftsim.errors import ConfigError
-from rlftsim.viewer.film import to_film
+from rlftsim.viewer.film import find_writer, to_film
 from rlftsim.viewer.picture import draw_scene
 
 
@@ -27,6 +31,18 @@ def blue_columns(frame):
     frame = frame[: int(len(frame) * 0.85)].astype(int)  # above the legend
     is_blue = (frame[..., 2] > 150) & (frame[..., 0] < 90)
     return [float(np.nonzero(half)[1].mean()) for half in np.split(is_blue, [frame.shape[1] // 2], axis=1)]
+
+
+def test_ctrl_c_of_the_terminal_is_no_matter_of_ffmpeg(tmp_path, capfd):
+    def frames():
+        yield np.zeros((64, 64, 3), np.uint8)
+        (process,) = Path(f"/proc/{os.getpid()}/task/{threading.get_native_id()}/children").read_text().split()
+        os.kill(int(process), signal.SIGINT)
+        yield np.zeros((64, 64, 3), np.uint8)
+
+    find_writer(tmp_path / "film.mp4")(tmp_path / "film.mp4", frames(), 10)
+    assert len(read_mp4(tmp_path / "film.mp4")[1]) == 2
+    assert capfd.readouterr().err == ""
 
 
 def test_an_mp4_plays_the_future_in_real_time_and_everybody_moves(animation, tmp_path):

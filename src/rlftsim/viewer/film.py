@@ -16,6 +16,7 @@ from PIL import Image
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.files import write_atomically
+from rlftsim.jobs.interruption import ctrl_c_blocked
 from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import draw_agents, draw_scene, light_dots
@@ -130,7 +131,8 @@ def _write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) ->
         str(path), (width, height), fps=round(frames_per_second), codec="libx264", quality=5, macro_block_size=2,
         output_params=["-f", "mp4", "-movflags", "+faststart"], ffmpeg_log_level="error",
     )  # fmt: skip
-    writer.send(None)  # starts the generator
+    with ctrl_c_blocked():  # it starts ffmpeg, which would print lines of its own after Ctrl-C
+        writer.send(None)
     for frame in itertools.chain([first], frames):
         writer.send(np.ascontiguousarray(frame))
     writer.close()
