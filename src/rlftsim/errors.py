@@ -74,7 +74,7 @@ def in_short(value: object) -> str:
 
 
 def shorten(text: str, most: int = MAX_MESSAGE) -> str:
-    """A text on one line, without control characters, and without its middle where it is long.
+    """A text on one line, without control characters, and without its middle, from word to word, where it is long.
 
     Args:
         text: Any text, such as a message that carries what a user wrote.
@@ -83,7 +83,8 @@ def shorten(text: str, most: int = MAX_MESSAGE) -> str:
     if len(text) > most:
         gap = f" ... {len(text) - most} characters and more ... "
         half = (most - len(gap)) // 2
-        text = text[:half] + gap + text[-half:]
+        # a word of more than 40 characters, such as a path, is cut all the same
+        text = re.sub(r"\s\S{,40}$", "", text[:half]) + gap + re.sub(r"^\S{,40}\s", "", text[-half:])
     return printable(text)
 
 

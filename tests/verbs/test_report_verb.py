@@ -75,6 +75,12 @@ def test_a_row_of_fewer_scenarios_says_how_many(folder, tmp_path):
     assert "what a perfect simulator would score, scenarios: 1" in page
 
 
+def test_a_single_evaluation_needs_no_list(folder, tmp_path):
+    path = folder / "oracle.parquet"
+    for number, result in enumerate((path, str(path), rs.Evaluation.read(path))):
+        assert "<h1>oracle</h1>" in rs.report(result, out=tmp_path / str(number)).read_text()
+
+
 def test_models_that_are_no_shipped_ones_are_named_and_recognized_by_their_weights(folder, tmp_path, capsys):
     evaluation = rs.Evaluation.read(folder / "demo-base.parquet")
     rs.Evaluation("mine", evaluation.provenance, evaluation.table).write(tmp_path / "mine.parquet")

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, find_direction, format_estimate
-from rlftsim.evaluation.results import LABELS, SCORE_COLUMNS, Evaluation
+from rlftsim.evaluation.results import SCORE_COLUMNS, Evaluation, find_column
 from rlftsim.statistics import cluster_bootstrap, mean_interval
 
 FEW_CLUSTERS = 10
@@ -117,11 +117,7 @@ class Comparison:
         Raises:
             ConfigError: A column that no evaluation has.
         """
-        column = LABELS.get(column, column)
-        for difference in self.differences:
-            if difference.column == column:
-                return difference
-        raise ConfigError(f"a comparison has no column {column!r}, only {', '.join(SCORE_COLUMNS)}.")
+        return self.differences[SCORE_COLUMNS.index(find_column(column))]
 
     @property
     def pairing(self) -> str:

@@ -3,6 +3,7 @@
 Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and `*_rate` in [0, 1], lower is better.
 """
 
+import difflib
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -17,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError, check_not_negative, check_types
+from rlftsim.errors import ConfigError, DataError, check_not_negative, check_types, in_short
 from rlftsim.evaluation.columns import SCORES, find_direction
 from rlftsim.evaluation.drift import Drift, measure_drift
 from rlftsim.jobs.documents import describe_type, parse_json
@@ -199,7 +200,8 @@ class Evaluation:
 
     @property
     def _title(self) -> str:
-        notes = [f"{len(self.skipped)} skipped"] if self.skipped else []
+        reason = f": {self.skipped[0].reason.rstrip('.')}" if self.skipped and not len(self) else ""
+        notes = [f"{len(self.skipped)} skipped{reason}"] if self.skipped else []
         notes += [f"{self.num_with_rmm} with RMM"] if self.num_with_rmm < len(self) else []
         note = f" ({', '.join(notes)})" if notes else ""
         config = self.config
@@ -237,10 +239,7 @@ class Evaluation:
         Raises:
             ConfigError: A column that no evaluation has.
         """
-        column = LABELS.get(column, column)
-        if column not in SCORE_COLUMNS:
-            raise ConfigError(f"an evaluation has no column {column!r}, only {', '.join(SCORE_COLUMNS)}.")
-        return self.table[column].to_numpy()
+        return self.table[find_column(column)].to_numpy()
 
     def mean_and_error(self, column: str) -> MeanInterval:
         """Mean, standard error and 95 % interval over the scenarios that have a value.
@@ -303,6 +302,21 @@ class Evaluation:
             error = "a value of another type" if isinstance(error, AttributeError) else error
             raise DataError(f"{path}: made by a later version ({error}): update rlftsim or evaluate again.") from None
         return cls(name, provenance, table.replace_schema_metadata(None), skipped)
+
+
+def find_column(name: str) -> str:
+    """Column of a name or of a label of tables.
+
+    Raises:
+        ConfigError: A column that no evaluation has; the message names the nearest one.
+    """
+    column = LABELS.get(name, name)
+    if column not in SCORE_COLUMNS:
+        columns = {label.lower(): column for label, column in LABELS.items()} | dict(zip(SCORE_COLUMNS, SCORE_COLUMNS))
+        near = difflib.get_close_matches(str(name).lower(), columns, n=1)
+        hint = f"did you mean {columns[near[0]]!r}?" if near else f"choose one of {', '.join(SCORE_COLUMNS)}."
+        raise ConfigError(f"an evaluation has no column {in_short(name)}: {hint}")
+    return column
 
 
 def _check_scores(table: pa.Table) -> None:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     Simulated: TypeAlias = Rollouts | str | os.PathLike[str]
     Result: TypeAlias = Evaluation | DriveResult | str | os.PathLike[str]
     Results: TypeAlias = Sequence[Result]
+    Reported: TypeAlias = Evaluation | str | os.PathLike[str] | Results
     Models: TypeAlias = Sequence[Model]
     Runs: TypeAlias = Sequence[str | os.PathLike[str]]
 else:
@@ -45,7 +46,7 @@ else:
     RecipeOption = Annotated[Any, Annotated[str, tyro.conf.arg(metavar="RECIPE")]]
     OnUpdate = Any
     File = Settings = GoalPoints = Simulated = Result = Annotated[Any, Path]
-    Results = Annotated[Any, tuple[Path, ...]]
+    Results = Reported = Annotated[Any, tuple[Path, ...]]
     Models = Runs = Annotated[Any, tuple[str, ...]]
     ScoreMetric = Annotated[Any, Literal["2025", "2024", "2024_original_code", "2023"]]
 

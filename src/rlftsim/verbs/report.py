@@ -1,5 +1,6 @@
 """`rs.report` and `rlftsim report`: a page that compares evaluated models and shows what they do."""
 
+import os
 from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
@@ -13,13 +14,13 @@ from rlftsim.policies import SHIPPED_POLICIES
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, frozen_copy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset, dataset_folder
-from rlftsim.verbs.arguments import Data, Device, File, Models, Results, Runs
+from rlftsim.verbs.arguments import Data, Device, File, Models, Reported, Runs
 from rlftsim.verbs.inputs import read_result, to_policy, validate_name, with_checked_arguments
 
 
 @with_checked_arguments
 def report(
-    results: Results,
+    results: Reported,
     *,
     out: File,
     models: Models = (),
@@ -39,7 +40,7 @@ def report(
 
     Args:
         results: Evaluations on the same scenarios, or their Parquet files: the reference first, then the judged one,
-            then any others, such as that of the oracle, whose score is what can be lost.
+            then any others, such as that of the oracle, whose score is what can be lost. In Python also a single one.
         out: Folder of report.html, and of pages and films of scenarios.
         models: Runs, model folders or registered names of the evaluated models, in any order. Models that ship need
             not be named.
@@ -57,6 +58,7 @@ def report(
         DataError: Evaluations that cannot be compared, no such file, or no such run.
     """
     out = Path(out)
+    results = [results] if isinstance(results, Evaluation | str | os.PathLike) else results
     evaluations = [read_result(result, Evaluation) for result in results]
     if not evaluations:
         raise ConfigError("a report needs an evaluation at least: name a Parquet file of `rlftsim evaluate`.")
