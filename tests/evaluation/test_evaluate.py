@@ -104,6 +104,21 @@ def test_what_cannot_be_scored_is_listed_with_the_reason(data, tmp_path):
     assert len(result) == 6
 
 
+def test_a_scenario_that_cannot_be_evaluated_is_named_with_the_reason():
+    result = rs.evaluate("oracle", scenes.without_road_edges(), num_rollouts=1)
+    assert "0 scenarios (1 skipped: Scenario no-edges has no road edge" in repr(result)
+    assert "missing_map" not in repr(result)
+    with pytest.raises(DataError, match=r"^1 of 1 scenarios withhold their future, the first is test-split with 11"):
+        rs.evaluate("oracle", scenes.without_future(), num_rollouts=1)
+
+
+@pytest.mark.parametrize("sampling", [rs.Sampling(temperature=0.5), rs.Sampling(top_k=5)])
+@pytest.mark.parametrize("policy", ["oracle", "constant_velocity"])
+def test_sampling_is_refused_where_nothing_is_sampled(policy, sampling):
+    with pytest.raises(ConfigError, match=rf"(temperature 0.5|top_k 5) has no effect: {policy} samples no decisions"):
+        rs.evaluate(policy, scenes.straight_road(), sampling=sampling)
+
+
 def test_a_future_of_padding_is_no_future(tmp_path):
     padded = scenes.without_agents(slice(HISTORY_STEPS, None))
     write_dataset([scenes.straight_road(), padded], tmp_path / "data", split="validation")
@@ -396,7 +411,7 @@ def test_mean_and_standard_error_over_scenarios(data, tmp_path):
     assert found.count == 6
     assert found.mean == pytest.approx(values.mean())
     assert found.standard_error == pytest.approx(np.sqrt(((values - found.mean) ** 2).sum() / 5 / 6))
-    with pytest.raises(ConfigError, match="no column 'rmm'"):
+    with pytest.raises(ConfigError, match="no column 'rmm': did you mean 'meta_metric'"):
         result.mean_and_error("rmm")
 
 

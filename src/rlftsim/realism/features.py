@@ -302,7 +302,7 @@ def _build_log(
     if road_edges is None and missing_map == "error":
         raise DataError(
             f"Scenario {scenario.scenario_id} has no road edge, so the distance to it is undefined: leave the scenario "
-            'out, or pass missing_map="neutral" to count all agents as on the road.'
+            "out."
         )
     scene = Surroundings(agents, road_edges, build_signals(scenario.map_features, scenario.lights, device))
     # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.

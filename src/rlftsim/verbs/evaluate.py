@@ -100,7 +100,8 @@ def evaluate(
         One row of scores per scenario; see `compare` for two of them. With `seconds` samples of each window.
 
     Raises:
-        ConfigError: A setting out of range, or goals for a policy that is not goal-conditioned.
+        ConfigError: A setting out of range, goals for a policy that is not goal-conditioned, or a temperature or
+            truncation for a policy that samples no decisions.
         DataError: No such data set or split, no scenario with a logged future, an unsound scenario, or a pose of the
             policy that is not finite.
     """
@@ -124,6 +125,10 @@ def evaluate(
         model = to_policy(policy, device)
         name = name or find_policy_name(model)
     model = with_guidance(model, guidance_scale)
+    if not sampling.is_full and (isinstance(model, str) or not model.noise_size):
+        option = "top_k" if sampling.temperature == 1.0 else "temperature"
+        value = getattr(sampling, option)
+        raise ConfigError(f"{option} {value:g} has no effect: {name} samples no decisions: leave it out.")
     if seconds is not None:
         if isinstance(model, str):
             raise ConfigError("the oracle has no long rollouts: the log is in every table, name a model.")
