@@ -131,7 +131,7 @@ def commands(sources, out):
             "--num-rollouts", "2", "--top-k", "None", "--scenarios-per-part", "2", "--device", "cpu",
         ],
         "score --explain": [
-            "score", sources / "rollouts", "--scenarios", sources / "set", "--name", "constant_velocity", "--out", out,
+            "score", sources / "rollouts", "--data", sources / "set", "--name", "constant_velocity", "--out", out,
             "--explain", out / "pages",
         ],
         "submit build": [

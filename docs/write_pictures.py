@@ -163,7 +163,7 @@ ASK = " --goal 191={},{} --guidance-scale 3 --export page"
 FUTURES = simulate("demo-tuned", SEVEN, "futures", " --picture")
 TURN = simulate("demo-goals", BRANCH, "turn", " --goal 99=102.6,76.9 --guidance-scale 3 --picture")
 DRIVE = f"rlftsim drive pdm --model demo-tuned --data synthetic --scenario {SEVEN} --out drive --film first"
-EXPLAIN = (simulate("demo-tuned", WALKERS, "scored", ""), "rlftsim score scored --scenarios synthetic --explain pages")
+EXPLAIN = (simulate("demo-tuned", WALKERS, "scored", ""), "rlftsim score scored --data synthetic --explain pages")
 
 PIECES = (
     Piece(

@@ -494,7 +494,7 @@ def make_rollouts(folder: Path) -> None:
 
 def score(name: str, scenarios: str = "set") -> Callable[[Path], None]:
     """A score of rollouts."""
-    return lambda folder: run("score", folder / name, "--scenarios", folder / scenarios, "--jobs", 1)
+    return lambda folder: run("score", folder / name, "--data", folder / scenarios, "--jobs", 1)
 
 
 def make_messages(folder: Path) -> None:

@@ -324,7 +324,7 @@ def test_goals_by_object_id_equal_those_of_the_command_line(follower, data, home
 def test_score_equals_the_command_line(base, data, metric):
     words = ["simulate", "runs/base", "--data", SMALL, "--out", "runs/rollouts", "--num-rollouts", "3", "--seed", "5"]
     assert main([*words, "--device", "cpu"]) == 0
-    assert main(["score", "runs/rollouts", "--scenarios", SMALL, "--out", "runs/scores", "--metric", metric]) == 0
+    assert main(["score", "runs/rollouts", "--data", SMALL, "--out", "runs/scores", "--metric", metric]) == 0
     rows = {row["scenario_id"]: row for row in Evaluation.read(Path("runs/scores/rollouts.parquet")).table.to_pylist()}
     assert set(rows) == set(data.scenario_ids)
     for scenario in data:

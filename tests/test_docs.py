@@ -194,7 +194,7 @@ def test_a_page_that_lies_would_be_seen(tmp_path, monkeypatch):
     with pytest.raises(AssertionError) as caught:
         run.run(blocks_of(page)[1])
     assert caught.traceback[-1].lineno == 9  # counted from 0: the tenth line of the page
-    page.write_text("```sh\nrlftsim score nothing --scenarios synthetic\n```\n")
+    page.write_text("```sh\nrlftsim score nothing --data synthetic\n```\n")
     with pytest.raises(RuntimeError, match=r"lie.md:1: status 2 of rlftsim score"):
         run.run(blocks_of(page)[0])
     assert_alike("1.2301 m of 7\n", "1.2300 m of 7\n", TOLERANCE)

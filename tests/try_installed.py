@@ -14,7 +14,7 @@ from pathlib import Path
 SCENARIO = "9d639de83d6f5239"
 COMMANDS = (
     f"simulate demo-tuned --data synthetic --scenario {SCENARIO} --out rollouts",
-    "score rollouts --scenarios synthetic --explain pages",
+    "score rollouts --data synthetic --explain pages",
 )
 WHERE = """
 import importlib.metadata, pathlib, sys, rlftsim

@@ -75,7 +75,7 @@ def test_every_stage_runs_on_the_data(files, tmp_path, capsys):
                                         "--device", "cpu", "--num-rollouts", 2)  # fmt: skip
     rollouts = tmp_path / "rollouts"
     run(capsys, "simulate", tuned, "--data", data, "--out", rollouts, "--num-rollouts", 2, "--device", "cpu")
-    scores = json.loads(run(capsys, "score", rollouts, "--scenarios", data, "--json", "--explain", tmp_path / "pages"))
+    scores = json.loads(run(capsys, "score", rollouts, "--data", data, "--json", "--explain", tmp_path / "pages"))
     assert (scores["sources"], scores["guessed"]) == (["av2"], ["size", "z"])
     pages = list((tmp_path / "pages").rglob("*.html"))
     assert len(pages) == 2

@@ -83,6 +83,13 @@ def test_a_shell_completes_verbs_actions_flags_and_names_of_files(tmp_path):
     assert "\ncomplete -o default -F _rlftsim rlftsim\n" in SCRIPT  # nothing fits: names of files
 
 
+@pytest.mark.parametrize("words", [[], ["--help"], ["--version"], ["score", "--help"]])
+def test_help_on_a_full_disk_ends_in_one_line(words):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-m", "rlftsim", *words], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "rlftsim: the disk is full: free some space and repeat the command.\n")
+
+
 def test_a_misspelled_verb_is_guessed(capsys):
     status, _, err = run(capsys, "finetun")
     assert (status, err) == (2, "rlftsim: no verb 'finetun': did you mean finetune?\n")
@@ -277,7 +284,7 @@ WRONG = {
     "no processes to convert with": ("convert {tmp} {tmp}/o --jobs 0", "--jobs must be at least 1, got 0"),
     "fewer processes than none": ("synthesize {tmp}/o --jobs -1", "--jobs must be at least 1, got -1"),
     "no scenarios to make": ("synthesize {tmp}/o --num-scenarios 0", "--num-scenarios must be at least 1, got 0"),
-    "no scenarios to score": ("score {tmp} --scenarios synthetic --limit 0", "limit must be at least 1, got 0"),
+    "no scenarios to score": ("score {tmp} --data synthetic --limit 0", "limit must be at least 1, got 0"),
     "no seeds": ("experiment benchmark --out {tmp}/o --seeds 0", "--seeds must be at least 1, got 0"),
     "no rollouts to sample goals from": (
         "augment {tmp} --data synthetic --out {tmp}/o --num-rollouts 0",
@@ -634,7 +641,7 @@ def test_what_can_be_no_folder_is_no_output(name, cause, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("name", "cause"), [("loop", "a link that leads nowhere"), ("pipe", "a pipe or device")])
-@pytest.mark.parametrize("line", ["convert SOURCE OUT", "score SOURCE --scenarios synthetic"])
+@pytest.mark.parametrize("line", ["convert SOURCE OUT", "score SOURCE --data synthetic"])
 def test_a_source_that_is_no_file_is_called_what_it_is(line, name, cause, tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")
     os.mkfifo(tmp_path / "pipe")
@@ -931,7 +938,7 @@ def test_a_terminal_without_a_sign_gets_another_one_in_its_place(tmp_path):
         ["evaluate", "constant_velocity", "--data", "d\n\x1b[2J" * 50_000, "--out", "o"],
         ["drive", "p" * 100_000, "--data", "synthetic", "--out", "o"],
         ["finetune", "smart-demo", "--model", "m" * 100_000, "--data", "synthetic", "--out", "o"],
-        ["score", "r" * 100_000, "--scenarios", "synthetic"],
+        ["score", "r" * 100_000, "--data", "synthetic"],
         ["convert", "s\n" * 50_000, "o"],
         ["evaluate", "constant_velocity", "--data", "synthetic", "--out", "o", "--metric", "2\n" * 50_000],
         ["evaluate", "constant_velocity", "--data", "synthetic", "--out", "o", "--seed", "9" * 100_000],

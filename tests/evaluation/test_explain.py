@@ -130,7 +130,7 @@ def test_pages_by_shares_and_after_an_interruption_are_the_same(scenario, tmp_pa
         return [
             "score",
             str(tmp_path / "rollouts"),
-            "--scenarios",
+            "--data",
             str(tmp_path / "data"),
             *folders,
             "--missing-map",

@@ -76,7 +76,7 @@ def test_files_of_long_rollouts_play_and_are_not_scored(scenario, tmp_path, caps
     with np.load(out / f"{scenario.scenario_id}.npz") as arrays:
         assert arrays["x"].shape[2] == 120
     assert json.loads((out / "rollouts.json").read_text())["num_steps"] == 120
-    assert main(["score", str(out), "--scenarios", "synthetic"]) != 0
+    assert main(["score", str(out), "--data", "synthetic"]) != 0
     assert "rollouts of 12 s (120 steps), where 8 s are compared with the log" in capsys.readouterr().err
     assert main(["simulate", "constant_velocity", *options]) != 0  # 8 s, in a folder of 12 s
     assert "another num_steps" in capsys.readouterr().err

@@ -324,5 +324,5 @@ def test_stored_open_worlds_continue_and_are_refused_by_the_metric(scenario, tmp
     changed = file.stat().st_mtime_ns
     assert main([*command, "--entries", "none", "--out", out]) == 0
     assert file.stat().st_mtime_ns == changed
-    assert main(["score", out, "--scenarios", "synthetic"]) == 2
+    assert main(["score", out, "--data", "synthetic"]) == 2
     assert "agents leave and enter" in " ".join(capsys.readouterr().err.split())

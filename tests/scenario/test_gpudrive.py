@@ -235,7 +235,7 @@ def test_rollouts_go_back_into_files_that_hold_their_poses(make_message, make_tf
     words = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "r"), "--num-rollouts", "2", "--device", "cpu"]
     assert main(["simulate", "constant_velocity", *words]) == 0
     out = tmp_path / "json"
-    assert main(["export", "gpudrive", str(tmp_path / "r"), str(out), "--scenarios", str(tmp_path / "data")]) == 0
+    assert main(["export", "gpudrive", str(tmp_path / "r"), str(out), "--data", str(tmp_path / "data")]) == 0
     assert str(out / "tfrecord-0a1b_*.json") in capsys.readouterr().out
     files = sorted(out.iterdir())
     assert [file.name for file in files] == ["tfrecord-0a1b_0.json", "tfrecord-0a1b_1.json"]

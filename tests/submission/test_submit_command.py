@@ -124,7 +124,7 @@ def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkey
     assert main(["submit", "check", "a.tar.gz", "--data", "set", "--score"]) == 0
     lines = capsys.readouterr().out.splitlines()
     skip = ("--missing-map", "skip", "--jobs", "1")
-    assert main(["score", "unpacked", "--scenarios", "set", "--name", "a", *skip]) == 0
+    assert main(["score", "unpacked", "--data", "set", "--name", "a", *skip]) == 0
     expected = capsys.readouterr().out.splitlines()
     of_tables = [[line.split() for line in some if "0." in line and "likelihood" in line] for some in (lines, expected)]
     assert len(of_tables[0]) > 8

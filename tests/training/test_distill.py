@@ -129,7 +129,7 @@ def test_a_student_is_calibrated_simulated_driven_and_exported_like_any_other(te
     assert main(words) == 0
     assert main(["model", "export", str(tmp_path / "student"), str(tmp_path / "s.safetensors")]) == 2
     assert "SMART" in capsys.readouterr().err
-    words = ["export", "page", str(tmp_path / "rollouts"), str(tmp_path / "pages"), "--scenarios", "synthetic"]
+    words = ["export", "page", str(tmp_path / "rollouts"), str(tmp_path / "pages"), "--data", "synthetic"]
     assert main(words) == 0
 
 

@@ -23,6 +23,15 @@ DEBUG = "--debug"
 """Word of any command that shows an error with its traceback, not as one line."""
 COMPLETION = "--completion"
 """Word that is followed by a shell, whose script is printed, or by the words that the script wants continued."""
+SYNONYMS = {
+    **dict.fromkeys(("train", "fit"), "pretrain or finetune"),
+    **dict.fromkeys(("rollout", "sample", "predict", "infer", "generate"), "simulate"),
+    **dict.fromkeys(("test", "validate", "benchmark"), "evaluate"),
+    **dict.fromkeys(("metric", "metrics", "rmm"), "score"),
+    **dict.fromkeys(("play", "view", "visualize"), "studio"),
+    **{"render": "export film", "plan": "drive", "download": "data pull", "upload": "model push", "list": "models"},
+}
+"""Verbs of other programs -> those of the same meaning."""
 OVERVIEW = "\n".join(
     [
         f"rlftsim {__version__}: traffic agents that behave like real road users.\n",
@@ -49,13 +58,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     shows_traceback = DEBUG in words
     words = [word for word in words if word != DEBUG]
-    if not words or words[0] in ("-h", "--help", "help"):
-        print(OVERVIEW, end="")
-        return 0 if words else USER_MISTAKE
-    if words[0] in ("-V", "--version"):
-        print(f"rlftsim {__version__}")
-        return 0
     try:
+        if not words or words[0] in ("-h", "--help", "help"):
+            print(OVERVIEW, end="", flush=True)
+            return 0 if words else USER_MISTAKE
+        if words[0] in ("-V", "--version"):
+            print(f"rlftsim {__version__}", flush=True)
+            return 0
         if words[0] == COMPLETION:
             from rlftsim.cli.completion import SCRIPT, list_next_words
 
@@ -102,8 +111,10 @@ def parse(words: Sequence[str]) -> Any:
         SystemExit: They ask for help, which has been printed.
     """
     if words[0] not in (*VERBS, JOIN):
-        matches = difflib.get_close_matches(words[0], [*VERBS, JOIN], 1)
-        hint = f"did you mean {matches[0]}?" if matches else f"known are {', '.join(VERBS)}."
+        matches = (
+            [SYNONYMS[words[0]]] if words[0] in SYNONYMS else difflib.get_close_matches(words[0], [*VERBS, JOIN], 1)
+        )
+        hint = f"did you mean {matches[0]}?" if matches else f"known are {', '.join([*VERBS, JOIN])}."
         raise ConfigError(f"no verb {in_short(words[0])}: {hint}")
     for word in words:
         if not word.strip():

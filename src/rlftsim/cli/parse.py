@@ -40,19 +40,34 @@ def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
     return f"no action {words[0]}: {hint}"
 
 
-def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
+ANSWERS = {
+    "--resume": "the same command continues where the last one stopped.",
+    "--train-split": "all trainings learn from the split training of --data.",
+}
+"""Flags of other programs -> what is done here instead."""
+SYNONYMS = {"gpus": "processes", "devices": "processes"}
+"""Flags of other programs -> flags of the same meaning."""
+
+
+def explain(
+    words: Sequence[str], complaint: str, flags: Sequence[str], labels: Sequence[str] = (), section: str = ""
+) -> str:
     """Line about a mistake in a command line.
 
     Args:
         words: Words behind the verb.
         complaint: Output of tyro, a box of lines.
-        help_text: Help of the verb, for the flags that exist.
+        flags: Flags of the verb.
+        labels: Names of the words without a flag, such as "MODEL".
+        section: Section whose settings count, such as that of the method in force.
     """
-    flags = list(dict.fromkeys(FLAG.findall(help_text)))
     for flag in list_flags(words):
         if flag not in flags:
-            suggestion = nearest(flag, flags)
-            return f"no flag {flag}: " + (f"did you mean {suggestion}?" if suggestion else "`--help` lists them all.")
+            if flag[2:].upper() in labels:
+                return f"no flag {flag}: {flag[2:].upper()} is a word without a flag, right behind the verb."
+            suggestion = nearest(flag, flags, section)
+            advice = f"did you mean {suggestion}?" if suggestion else "`--help` lists them all."
+            return f"no flag {flag}: {ANSWERS.get(flag, advice)}"
     # `--switch yes`: tyro complains about the value alone
     left_over = re.search(r"Unrecognized options: (\S+)", complaint)
     for flag, word in pairwise(words):
@@ -63,23 +78,34 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     return _one_line(complaint)
 
 
-def nearest(flag: str, flags: Sequence[str]) -> str | None:
-    """The flag nearest to a mistyped flag; None = all are far.
+def nearest(flag: str, flags: Sequence[str], section: str = "") -> str | None:
+    """The flag nearest to a mistyped flag, or all of the same name in several sections; None = all are far.
 
     Args:
         flag: Mistyped flag, such as "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".
         flags: Flags that exist.
+        section: Section whose flag is meant where several have it, such as that of the method in force.
     """
     group, _, last = flag.removeprefix("--").rpartition(".")
-    siblings = [name for name in flags if name.removeprefix("--").rpartition(".")[0].startswith(group)]
-    # 1. the right name without its group, 2. initials, 3. a typing mistake in the last part, 4. one anywhere
-    parts = [(name.removeprefix("--").rpartition(".")[2], name) for name in reversed(siblings)]  # the first one stays
-    by_last = dict(parts)
-    by_initials = {"".join(word[:1] for word in part.split("-")): name for part, name in parts}
-    close = [by_last[part] for part in difflib.get_close_matches(last, by_last, n=1, cutoff=0.75)]
-    match = by_last.get(last) or by_initials.get(last) or next(iter(close), None)
-    if match or (group and siblings):  # the group is right: a flag of another one would be a wild guess
-        return match
+    last = SYNONYMS.get(last, last)
+    by_last: dict[str, list[str]] = {}
+    for name in flags:
+        prefix, _, part = name.removeprefix("--").rpartition(".")
+        if prefix.startswith(group):
+            by_last.setdefault(part, []).append(name)
+    # 1. the right name without its group, 2. initials, 3. a typing mistake in the last part, 4. a group, 5. any
+    by_initials = {"".join(word[:1] for word in part.split("-")): part for part in reversed(by_last)}
+    close = difflib.get_close_matches(last, by_last, n=1, cutoff=0.75)
+    part = last if last in by_last else by_initials.get(last) or next(iter(close), None)
+    if part:
+        siblings = by_last[part]
+        preferred = [name for name in (f"--{part}", f"--{section}.{part}") if name in siblings]
+        return " or ".join(preferred[:1] or siblings)
+    members = [name for name in flags if f".{last}." in name]
+    if members:
+        return next((name for name in members if name.startswith(f"--{section}.")), members[0])
+    if group and by_last:  # the group is right: a flag of another one would be a wild guess
+        return None
     # without the hyphens, which all have in common: "--limit" is not "--split"
     names = [name.removeprefix("--") for name in flags]
     return next((f"--{name}" for name in difflib.get_close_matches(flag.removeprefix("--"), names, 1, 0.65)), None)
@@ -212,7 +238,9 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
         with redirect_stderr(complaint), _wide():
             call = read(complete)
     except SystemExit:
-        message = explain(words, complaint.getvalue(), _help_text(read))
+        labels = [command.names.get(name, name.upper()) for name in command.positional]
+        names = list(dict.fromkeys(FLAG.findall(_help_text(read))))
+        message = explain(words, complaint.getvalue(), names, labels, flags.run_section if flags else "")
         # A setting of a file is a flag that the user never typed: the file is to blame.
         blamed = FLAG.match(message)
         if blamed and blamed[0] in set(list_flags(complete)) - set(list_flags(words)):

@@ -165,7 +165,7 @@ VERBS = {
     ),
     "export": Verb(
         "write stored rollouts as files that other programs read",
-        Command("export:export", ("exporter", "rollouts", "out"), ("scenarios",), {"exporter": "FORMAT"}),
+        Command("export:export", ("exporter", "rollouts", "out"), ("scenarios",), {"exporter": "FORMAT", **DATA}),
         starts_anew=True,
     ),
     "drive": Verb("let a planner drive among simulated traffic, and score both", Command("drive:drive", ("planner",))),
@@ -187,7 +187,7 @@ VERBS = {
     ),
     "score": Verb(
         "score rollouts of any simulator with the official realism meta-metric",
-        Command("score:score", ("rollouts",), show="print_scores", has_shares=True),
+        Command("score:score", ("rollouts",), names=DATA, show="print_scores", has_shares=True),
         begins_group=True,
     ),
     "evaluate": Verb(
