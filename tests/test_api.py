@@ -1002,8 +1002,12 @@ def test_goals_in_another_frame_are_refused(follower, data):
 
 
 def test_a_misspelled_public_name_has_a_suggestion():
-    with pytest.raises(AttributeError, match="no attribute 'simulat': did you mean 'simulate'"):
+    with pytest.raises(AttributeError, match="no attribute 'simulat': did you mean simulate"):
         _ = rs.simulat
+    with pytest.raises(AttributeError, match="no attribute 'load_model': did you mean load_policy"):
+        _ = rs.load_model
+    with pytest.raises(AttributeError, match=r"no attribute 'EgoEnv': did you mean rlftsim\.envs\.EgoEnv"):
+        _ = rs.EgoEnv
     assert repr(CV) == "ConstantVelocity()"
 
 

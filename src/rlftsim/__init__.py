@@ -49,6 +49,15 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_MODULE_OF)
+_SYNONYMS = {
+    **dict.fromkeys(("load_model", "from_pretrained"), "load_policy"),
+    **dict.fromkeys(("load_data", "load_scenarios"), "load_dataset"),
+    **dict.fromkeys(("rollout", "sample"), "simulate"),
+    **{name: f"rlftsim.envs.{name}" for name in ("EgoEnv", "EgoVectorEnv", "EnvConfig", "parallel_env")},
+    **dict.fromkeys(("make", "make_vec"), 'gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)'),
+    **dict.fromkeys(("train", "fit"), "pretrain or finetune"),
+}
+"""Names that people type first -> what they want."""
 
 
 def __getattr__(name: str) -> Any:
@@ -57,10 +66,8 @@ def __getattr__(name: str) -> Any:
 
         from rlftsim.verbs.commands import COMMANDS
 
-        near = difflib.get_close_matches(name, __all__, n=1, cutoff=0.8)
-        hint = (
-            f": did you mean {near[0]!r}?" if near else ": it is a command, rlftsim " + name if name in COMMANDS else ""
-        )
+        near = _SYNONYMS.get(name) or next(iter(difflib.get_close_matches(name, __all__, n=1, cutoff=0.8)), None)
+        hint = f": did you mean {near}?" if near else ": it is a command, rlftsim " + name if name in COMMANDS else ""
         raise AttributeError(f"module 'rlftsim' has no attribute {name!r}{hint}")
     value = getattr(importlib.import_module(_MODULE_OF[name]), name)
     if "IPython" in sys.modules:  # a notebook plays scenarios and rollouts that end a cell

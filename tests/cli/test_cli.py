@@ -718,11 +718,18 @@ def test_comparing_an_evaluation_with_itself(evaluation, capsys):
     assert "oracle" in out
 
 
-def test_doctor_looks_at_everything(capsys):
+@pytest.mark.parametrize(
+    ("policy", "way_out"), [("PASSIVE", "set OMP_NUM_THREADS=1"), ("ACTIVE", "set OMP_WAIT_POLICY=PASSIVE, or OMP_NUM")]
+)
+def test_doctor_looks_at_everything(policy, way_out, capsys, monkeypatch):
+    seconds = iter([1.0, 3.0])
+    monkeypatch.setattr("rlftsim.verbs.doctor._seconds_of_work", lambda: next(seconds))
+    monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     status, out, _ = run(capsys, "doctor")
     assert status in (0, 1)
-    for what in ("Python", "torch", "threads", "GPU", "SUMO", "disk", "synthetic scenarios"):
+    for what in ("Python", "torch", "threads", "GPU", "SUMO", "environments", "disk", "synthetic scenarios"):
         assert what in out
+    assert f"2 threads take 3.0 times as long as 1: {way_out}" in out
 
 
 def test_a_model_folder_without_weights_or_with_garbage_is_refused_in_words(tmp_path, capsys):

@@ -164,3 +164,14 @@ def test_the_verb_makes_a_student_of_any_model(teacher, drawn_scenarios, monkeyp
     assert rs.simulate(student, drawn_scenarios[0], num_rollouts=2, seed=0).position.isfinite().all()
     again = distill(load_policy(teacher), drawn_scenarios[:2], epochs=1.0, processes=1)
     assert fingerprint_policy(again) == fingerprint_policy(student)
+
+
+def test_a_student_cut_short_is_a_model_and_learns_on_to_equal_weights(teacher, drawn_scenarios, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "rlftsim.policies.smart.compact.STUDENTS", {"small": (CompactConfig(dim=8, hidden=16), NUM_TOKENS)}
+    )
+    whole = distill(teacher, drawn_scenarios[:2], epochs=2.0, processes=1)
+    short = distill(teacher, drawn_scenarios[:2], tmp_path, epochs=2.0, max_updates=1, processes=1)
+    assert fingerprint_policy(load_policy(tmp_path)) == fingerprint_policy(short) != fingerprint_policy(whole)
+    longer = distill(teacher, drawn_scenarios[:2], tmp_path, epochs=2.0, processes=1)
+    assert fingerprint_policy(longer) == fingerprint_policy(whole)

@@ -22,6 +22,7 @@ def distill(
     *,
     size: Literal["small"] = "small",
     epochs: float | None = None,
+    max_updates: int | None = None,
     processes: Processes = None,
     limit: int | None = None,
     seed: int | None = None,
@@ -43,6 +44,8 @@ def distill(
             left out, no file is kept.
         size: Size of the student. small: 63,200 weights, 512 of the teacher's tokens of each class.
         epochs: Passes over the training scenarios; left out, 5.
+        max_updates: Updates after which the run ends early, with a model. A larger number later continues to the
+            weights of a whole run.
         processes: Processes that train; left out, as many as the machine has cores for.
         limit: Number of training scenarios, from the first on; left out, all.
         seed: Seed of weights and rollouts.
@@ -65,7 +68,8 @@ def distill(
     student_type: Any = POLICIES.get("compact")
     lesson = Lesson(student_type.new_student(size, teacher.vocabulary, training, settings.seed), teacher)
     card = write_card("distilled", training, policy)
-    train(lesson, training, out, settings, device=device, tracker="tensorboard", held_out=None, card=card)
+    options: Any = {"max_updates": max_updates, "tracker": "tensorboard", "held_out": None, "card": card}
+    train(lesson, training, out, settings, device=device, **options)
     return lesson.student
 
 

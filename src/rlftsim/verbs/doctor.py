@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -81,7 +82,7 @@ def doctor(
         if value != inspect.signature(doctor).parameters[name].default:
             flag = f"--{name.replace('_', '-')}"
             raise ConfigError(f"{flag} has no effect: add --plan evaluate, convert, submit, finetune or pretrain.")
-    diagnoses = [*_versions(), _threads(), _gpu(), _sumo(), _disk(), _pack()]
+    diagnoses = [*_versions(), _threads(), _gpu(), _sumo(), _environments(), _disk(), _pack()]
     table = Table(show_header=False)
     color = {GOOD: "green", WARNING: "yellow", BAD: "red"}
     for subject, state, finding in diagnoses:
@@ -111,8 +112,9 @@ def _threads() -> Diagnosis:
     finding = f"{os.cpu_count()} cores, 2 threads take {seconds[1] / seconds[0]:.1f} times as long as 1"
     if seconds[1] <= 1.5 * seconds[0]:
         return "threads", GOOD, finding
-    policy = os.environ.get("OMP_WAIT_POLICY", "not set")
-    return "threads", WARNING, f"{finding}: OMP_WAIT_POLICY is {policy}, set it to PASSIVE or use 1 thread"
+    is_passive = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
+    way_out = "set OMP_NUM_THREADS=1" if is_passive else "set OMP_WAIT_POLICY=PASSIVE, or OMP_NUM_THREADS=1"
+    return "threads", WARNING, f"{finding}: {way_out}"
 
 
 def _seconds_of_work() -> float:
@@ -135,8 +137,16 @@ def _sumo() -> Diagnosis:
     try:
         return "SUMO", GOOD, version("eclipse-sumo")
     except PackageNotFoundError:
-        hint = 'not installed: only `rlftsim synthesize` needs it (pip install "rlftsim[synthetic]")'
+        hint = 'not installed: `rlftsim synthesize` and traffic by SUMO need it (pip install "rlftsim[synthetic]")'
         return "SUMO", WARNING, hint
+
+
+def _environments() -> Diagnosis:
+    missing = [package for package in ("gymnasium", "pettingzoo") if find_spec(package) is None]
+    if missing:
+        hint = f"{' and '.join(missing)} not installed: `rlftsim drive`, `failures` and `rlftsim.envs` need them"
+        return "environments", WARNING, f'{hint} (pip install "rlftsim[env]")'
+    return "environments", GOOD, f"gymnasium {version('gymnasium')}, pettingzoo {version('pettingzoo')}"
 
 
 def _disk() -> Diagnosis:
