@@ -60,6 +60,8 @@ class PackageError(RlftsimError):
     exit_status = 1
 
 
+PERMISSION_WAY_OUT = "give yourself permission (chmod u+rwX), or name another file or folder"
+"""End of a message about a file or folder that is closed to the user."""
 MAX_VALUE, MAX_MESSAGE = 100, 800
 """Characters of a value in a message, and of a message."""
 

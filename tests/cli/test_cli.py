@@ -11,6 +11,7 @@ import sys
 import typing
 from dataclasses import replace
 from functools import wraps
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +23,7 @@ import rlftsim as rs
 from rlftsim import __version__
 from rlftsim.cli.completion import SCRIPT
 from rlftsim.cli.main import VERBS, main, parse
+from rlftsim.errors import PERMISSION_WAY_OUT
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -414,7 +416,7 @@ def test_a_line_that_cannot_be_read_is_explained(line, capsys):
             1,
             "rlftsim: the disk is full: free some",
         ),
-        (PermissionError(errno.EACCES, "Permission denied", "/data/x"), 1, "rlftsim: Permission denied: /data/x"),
+        (PermissionError(errno.EACCES, "Permission denied", "/data/x"), 1, "rlftsim: Permission denied: /data/x: give"),
         (torch.OutOfMemoryError("CUDA out of memory"), 1, "rlftsim: the GPU has too little memory: lower"),
     ],
 )
@@ -426,6 +428,23 @@ def test_what_stops_a_verb_is_one_line(error, expected, line, capsys, monkeypatc
     status, _, err = run(capsys, "data", "stats", "synthetic")
     assert (status, err.strip().count("\n")) == (expected, 0)
     assert err.strip().startswith(line)
+
+
+@pytest.mark.parametrize("words", ["score FOLDER --scenarios synthetic", "convert FOLDER out", "data verify FOLDER"])
+def test_a_folder_that_is_closed_to_the_user_is_named_with_the_way_out(words, tmp_path, capsys, monkeypatch):
+    def guard(call, is_closed):
+        def guarded(path=".", *arguments, **options):
+            if is_closed(Path(str(path))):
+                raise PermissionError(errno.EACCES, "Permission denied", str(path))
+            return call(path, *arguments, **options)
+
+        return guarded
+
+    monkeypatch.setattr(os, "scandir", guard(os.scandir, lambda path: path == tmp_path))
+    monkeypatch.setattr(os, "stat", guard(os.stat, lambda path: tmp_path in path.parents))
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path)
+    status, _, err = run(capsys, *words.replace("FOLDER", str(tmp_path)).split())
+    assert (status, err) == (1, f"rlftsim: Permission denied: {tmp_path}: {PERMISSION_WAY_OUT}.\n")
 
 
 def test_a_command_runs_what_others_have_put_around_a_verb(capsys, monkeypatch):
@@ -730,6 +749,11 @@ def test_doctor_looks_at_everything(policy, way_out, capsys, monkeypatch):
     for what in ("Python", "torch", "threads", "GPU", "SUMO", "environments", "disk", "synthetic scenarios"):
         assert what in out
     assert f"2 threads take 3.0 times as long as 1: {way_out}" in out
+
+
+def test_doctor_names_a_folder_that_cannot_be_written_to(capsys, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "cannot be written to: work in another folder" in " ".join(run(capsys, "doctor")[1].split())
 
 
 def test_a_model_folder_without_weights_or_with_garbage_is_refused_in_words(tmp_path, capsys):

@@ -10,10 +10,11 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rlftsim import __version__
-from rlftsim.errors import ConfigError, RlftsimError, find_package_error, in_short, shorten
+from rlftsim.errors import PERMISSION_WAY_OUT, ConfigError, RlftsimError, find_package_error, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.jobs.threads import keep_freed_memory
 from rlftsim.verbs.commands import COMMANDS, UNCHECKED, VERBS
@@ -149,6 +150,11 @@ def _in_words(error: Exception) -> str | None:
             "the GPU has too little memory: lower the number of scenarios or rollouts in memory at once (see --help)."
         )
     if isinstance(error, OSError):
-        way_out = ": choose a shorter name." if error.errno == errno.ENAMETOOLONG else ""
-        return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}{way_out}"
+        path, way_out = error.filename, ": choose a shorter name." if error.errno == errno.ENAMETOOLONG else ""
+        if isinstance(error, PermissionError) and path:
+            # the folder that is closed, not a file that was looked for inside
+            folders = (folder for folder in reversed(Path(path).parents) if folder.is_dir())
+            path = next((folder for folder in folders if not os.access(folder, os.X_OK)), path)
+            way_out = f": {PERMISSION_WAY_OUT}."
+        return f"{error.strerror or error}{f': {path}' if path else ''}{way_out}"
     return None

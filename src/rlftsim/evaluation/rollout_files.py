@@ -20,7 +20,7 @@ from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.wire_format import BYTES, MAX_FIELD_BYTES, WireField, iterate_fields
 from rlftsim.jobs.arrays import read_npz
 from rlftsim.jobs.documents import check_has_end
-from rlftsim.jobs.files import describe_type
+from rlftsim.jobs.files import describe_type, list_folder
 from rlftsim.realism import SimulatedStates
 from rlftsim.realism.agents import check_closed
 from rlftsim.rollout.decisions import MAX_COORDINATE_M
@@ -69,7 +69,7 @@ def find_rollouts(source: str | PathLike[str]) -> list[RolloutEntry]:
     if not source.is_dir():
         raise DataError(f"{source}: {describe_type(source)}: name a file or folder of rollouts.")
     # hidden files are those that a writer has not finished, or an editor's
-    paths = sorted(path for path in source.rglob("*") if path.is_file() and not path.name.startswith("."))
+    paths = sorted(path for path in list_folder(source) if path.is_file() and not path.name.startswith("."))
     files = [path for path in paths if path.suffix == ".npz" or _SUBMISSION_NAME.search(path.name)]
     pickles = [path for path in paths if _PICKLE_NAME.search(path.name)]
     if not files and pickles:

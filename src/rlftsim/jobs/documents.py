@@ -18,7 +18,7 @@ from typing import Any
 from zlib import decompressobj
 from zlib import error as ZlibError
 
-from rlftsim.errors import DataError, RlftsimError, printable
+from rlftsim.errors import PERMISSION_WAY_OUT, DataError, RlftsimError, printable
 
 MAX_TEXT_BYTES = 64 << 20
 """Largest text that is parsed; the largest that this package writes is the manifest of a data set, some MB."""
@@ -216,7 +216,8 @@ def explained_damage(
             raise error(missing) from None
         raise
     except damage as problem:
-        raise error(f"{path}{words} ({describe(problem)}): {remedy}.") from None
+        way_out = PERMISSION_WAY_OUT if isinstance(problem, PermissionError) else remedy
+        raise error(f"{path}{words} ({describe(problem)}): {way_out}.") from None
 
 
 def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError], missing: str) -> bytes:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
+from typing import NoReturn
 
 from safetensors.torch import save
 from torch import Tensor
@@ -108,6 +109,23 @@ def check_result_file(path: Path) -> None:
     """
     if path.exists() and not path.is_file():
         raise DataError(f"{path} is {describe_type(path)}, not a file: choose another --out or name, or remove it.")
+
+
+def list_folder(folder: Path) -> Iterator[Path]:
+    """Yields files and folders in a folder and its subfolders; unlike `Path.rglob` passes over none that is closed.
+
+    Args:
+        folder: Folder whose links to other folders are not followed.
+
+    Raises:
+        OSError: A folder that cannot be listed, such as for lack of permission.
+    """
+
+    def stop(error: OSError) -> NoReturn:
+        raise error
+
+    for root, folders, files in os.walk(folder, onerror=stop):
+        yield from map(Path(root).joinpath, (*folders, *files))
 
 
 def describe_type(path: Path) -> str:

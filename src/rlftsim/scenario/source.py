@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from rlftsim.errors import BadRecordError, DataError
+from rlftsim.jobs.files import list_folder
 from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.shards import check_scenario
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
@@ -128,7 +129,7 @@ def read_unit(source: DataSource, unit: Unit, *, on_error: OnError) -> Iterator[
 def list_files(path: str | os.PathLike[str]) -> set[Path]:
     """Paths at a path: a file, a folder with its subfolders, or a glob of either."""
     paths = [path] if os.path.exists(path) else glob.glob(str(path), recursive=True)
-    return {match for path in map(Path, paths) for match in (path.rglob("*") if path.is_dir() else [path])}
+    return {match for path in map(Path, paths) for match in (list_folder(path) if path.is_dir() else [path])}
 
 
 def units_of_files(files: Sequence[Path]) -> list[Unit]:

@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 
 from rlftsim.errors import DataError, in_short
 from rlftsim.geometry import wrapped
+from rlftsim.jobs.files import list_folder
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.polylines import Heights, densify
@@ -147,7 +148,7 @@ class TablesSource:
 
 
 def _find_tracks(path: str | os.PathLike[str]) -> list[Path]:
-    return sorted(Path(path).rglob(TRACKS)) if Path(path).is_dir() else []
+    return sorted(file for file in list_folder(Path(path)) if file.name == TRACKS) if Path(path).is_dir() else []
 
 
 def _read_scenario(row: Rows, tables: Mapping[str, Rows]) -> Scenario:

@@ -16,7 +16,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.files import describe_type
+from rlftsim.jobs.files import describe_type, list_folder
 from rlftsim.jobs.progress import log
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.source import BytesRead, Item, Unit, read_unit, units_of_files
@@ -61,7 +61,7 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if _TFRECORD_NAME.search(file.name) and file.is_file())
+        files = sorted(file for file in list_folder(path) if _TFRECORD_NAME.search(file.name) and file.is_file())
         if not files:
             raise DataError(
                 f"{path}: no tfrecord file in this folder (names like x.tfrecord or x.tfrecord-00000-of-00010), "

@@ -150,7 +150,11 @@ def _environments() -> Diagnosis:
 
 
 def _disk() -> Diagnosis:
-    free = {str(folder): shutil.disk_usage(folder).free / 1e9 for folder in (Path.cwd(), Path(tempfile.gettempdir()))}
+    folders = (Path.cwd(), Path(tempfile.gettempdir()))
+    for folder in folders:
+        if not os.access(folder, os.W_OK):
+            return "disk", WARNING, f"{folder} cannot be written to: work in another folder"
+    free = {str(folder): shutil.disk_usage(folder).free / 1e9 for folder in folders}
     finding = ", ".join(f"{gigabytes:.1f} GB free in {folder}" for folder, gigabytes in free.items())
     return "disk", GOOD if min(free.values()) >= MIN_FREE_GB else WARNING, finding
 
