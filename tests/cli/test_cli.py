@@ -430,7 +430,7 @@ def test_what_stops_a_verb_is_one_line(error, expected, line, capsys, monkeypatc
     assert err.strip().startswith(line)
 
 
-@pytest.mark.parametrize("words", ["score FOLDER --scenarios synthetic", "convert FOLDER out", "data verify FOLDER"])
+@pytest.mark.parametrize("words", ["score FOLDER --data synthetic", "convert FOLDER out", "data verify FOLDER"])
 def test_a_folder_that_is_closed_to_the_user_is_named_with_the_way_out(words, tmp_path, capsys, monkeypatch):
     def guard(call, is_closed):
         def guarded(path=".", *arguments, **options):
