@@ -200,5 +200,6 @@ def test_the_card_of_a_model_passes_on_the_terms_of_its_start(tmp_path):
     (tmp_path / "base").mkdir()
     (tmp_path / "base" / "README.md").write_bytes(b"# Base\n\n* terms of the data: non-commercial\n* by caf\xe9\n")
     card = model_card("fine-tuned", dataset_folder("synthetic"), 2, tmp_path / "base")
+    assert "* trained on 2 scenarios of synthetic\n" in card
     assert "* terms of the data: CC0-1.0" in card
     assert f"## Made from {tmp_path / 'base'}\n\n### Base\n\n* terms of the data: non-commercial\n* by caf" in card

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rlftsim.policies.checkpoint import read_card
-from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.dataset import SYNTHETIC, ScenarioDataset
 from rlftsim.scenario.sources import guessed_note
+from rlftsim.scenario.synthetic import pack_path
 from rlftsim.training.run_folder import describe_environment
 
 
@@ -25,7 +26,7 @@ def model_card(training: str, data: Path, num_scenarios: int, start: str | os.Pa
     guessed = f"* {note}\n" if note else ""
     card = f"""# Traffic model, {training}
 
-* trained on {num_scenarios} scenarios of {data.name}
+* trained on {num_scenarios} scenarios of {SYNTHETIC if data == pack_path() else data.name}
 * terms of the data: {dataset.manifest.license_note}
 {guessed}* command: rlftsim {" ".join(sys.argv[1:])}
 * rlftsim {environment["packages"]["rlftsim"]}, commit {environment["commit"] or "unknown"}
