@@ -20,7 +20,14 @@ from rlftsim.rollout.policy import Sampling, frozen_copy
 from rlftsim.scenario.dataset import ScenarioDataset, dataset_folder, write_dataset
 from rlftsim.scenario.open import to_scenarios
 from rlftsim.verbs.arguments import Data, Device, File, Metric, Model
-from rlftsim.verbs.inputs import check_left_out, find_policy_name, to_policy, to_sampling, with_checked_arguments
+from rlftsim.verbs.inputs import (
+    check_left_out,
+    check_sampling,
+    find_policy_name,
+    to_policy,
+    to_sampling,
+    with_checked_arguments,
+)
 
 BY_METRIC, LONG = ("metric", "goals", "jobs", "guidance_scale", "work"), ("entries", "ego")
 """Arguments without effect on long rollouts, and on rollouts of 8 s."""
@@ -92,16 +99,14 @@ def evaluate(
         split: Split of the data set; None = all scenarios. An opened data set has its own.
         device: Device of a model that is loaded; several processes (--jobs) need cpu.
         guidance_scale: Factor on the goal-progress bias of the logits, with --goals logged; above 1 goals count more.
-        rollouts_per_pass: Rollouts simulated together. Bounds memory and changes no result. A small model, such as
-            those that ship, is a quarter to a third faster with 32; SMART-tiny is not.
+        rollouts_per_pass: Rollouts simulated together. Bounds memory, changes no result; small models like 32.
         work: Machines that share the work.
 
     Returns:
         One row of scores per scenario; see `compare` for two of them. With `seconds` samples of each window.
 
     Raises:
-        ConfigError: A setting out of range, goals for a policy that is not goal-conditioned, or a temperature or
-            truncation for a policy that samples no decisions.
+        ConfigError: A setting out of range, or goals or a temperature that have no effect on the policy.
         DataError: No such data set or split, no scenario with a logged future, an unsound scenario, or a pose of the
             policy that is not finite.
     """
@@ -125,10 +130,7 @@ def evaluate(
         model = to_policy(policy, device)
         name = name or find_policy_name(model)
     model = with_guidance(model, guidance_scale)
-    if not sampling.is_full and (isinstance(model, str) or not model.noise_size):
-        option = "top_k" if sampling.temperature == 1.0 else "temperature"
-        value = getattr(sampling, option)
-        raise ConfigError(f"{option} {value:g} has no effect: {name} samples no decisions: leave it out.")
+    check_sampling(model, sampling)
     if seconds is not None:
         if isinstance(model, str):
             raise ConfigError("the oracle has no long rollouts: the log is in every table, name a model.")

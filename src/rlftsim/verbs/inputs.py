@@ -229,6 +229,24 @@ def to_sampling(sampling: Any) -> Sampling:
     return sampling or Sampling()
 
 
+def check_sampling(policy: Policy | str, sampling: Sampling) -> None:
+    """Check that temperature and truncation have an effect.
+
+    Args:
+        policy: Policy that decides, or the name of the log.
+        sampling: Temperature and truncation of the decisions.
+
+    Raises:
+        ConfigError: Either is set, and the policy samples nothing.
+    """
+    if not sampling.is_full and (isinstance(policy, str) or not policy.noise_size):
+        option = "top_k" if sampling.temperature == 1.0 else "temperature"
+        name = policy if isinstance(policy, str) else type(policy).__name__
+        raise ConfigError(
+            f"{option} {getattr(sampling, option):g} has no effect: {name} samples no decisions: leave it out."
+        )
+
+
 def to_recipe(recipe: Any) -> Recipe:
     """The recipe itself, or the recipe of a name.
 

@@ -20,7 +20,15 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.types import count_steps
 from rlftsim.verbs.arguments import Data, Device, File, GoalPoints, Model
 from rlftsim.verbs.goals import check_goal_effects, check_scenarios, read_given_goals
-from rlftsim.verbs.inputs import check_left_out, to_batch, to_dataset, to_policy, to_sampling, with_checked_arguments
+from rlftsim.verbs.inputs import (
+    check_left_out,
+    check_sampling,
+    to_batch,
+    to_dataset,
+    to_policy,
+    to_sampling,
+    with_checked_arguments,
+)
 
 IN_FILES = ("scenario", "limit", "goal", "picture", "export", "jobs", "work")
 """Arguments without effect on rollouts in memory."""
@@ -122,6 +130,7 @@ def simulate(
     loaded = to_policy(policy, device)
     # with dropout a seed would not say what happens
     model = with_guidance(frozen_copy(loaded) if is_training(loaded) else loaded, guidance_scale)
+    check_sampling(model, sampling)
     if out is None:
         batch = to_batch(scenarios, get_device(model), split)
         return simulate_in_memory(model, batch, num_rollouts, seed, num_steps, sampling, goals, entries)
