@@ -41,7 +41,7 @@ def explain_action(words: Sequence[str], actions: Sequence[str]) -> str:
 
 
 ANSWERS = {
-    "--resume": "the same command continues where the last one stopped.",
+    "--resume": "what can be continued continues with the same command.",
     "--train-split": "all trainings learn from the split training of --data.",
 }
 """Flags of other programs -> what is done here instead."""
@@ -49,22 +49,20 @@ SYNONYMS = {"gpus": "processes", "devices": "processes"}
 """Flags of other programs -> flags of the same meaning."""
 
 
-def explain(
-    words: Sequence[str], complaint: str, flags: Sequence[str], labels: Sequence[str] = (), section: str = ""
-) -> str:
+def explain(words: Sequence[str], complaint: str, flags: Sequence[str], usage: str, section: str) -> str:
     """Line about a mistake in a command line.
 
     Args:
         words: Words behind the verb.
         complaint: Output of tyro, a box of lines.
         flags: Flags of the verb.
-        labels: Names of the words without a flag, such as "MODEL".
-        section: Section whose settings count, such as that of the method in force.
+        usage: Command with the words that have no flag, such as "evaluate MODEL".
+        section: Section whose settings count, such as that of the method in force; empty without sections.
     """
     for flag in list_flags(words):
         if flag not in flags:
-            if flag[2:].upper() in labels:
-                return f"no flag {flag}: {flag[2:].upper()} is a word without a flag, right behind the verb."
+            if flag[2:].upper() in usage.split():
+                return f"no flag {flag}: write the value without a flag, as in `rlftsim {usage}`."
             suggestion = nearest(flag, flags, section)
             advice = f"did you mean {suggestion}?" if suggestion else "`--help` lists them all."
             return f"no flag {flag}: {ANSWERS.get(flag, advice)}"
@@ -238,9 +236,9 @@ def _parse_call(name: str, words: list[str], recipe: str | None = None) -> Call:
         with redirect_stderr(complaint), _wide():
             call = read(complete)
     except SystemExit:
-        labels = [command.names.get(name, name.upper()) for name in command.positional]
+        usage = " ".join([name, *(command.names.get(label, label.upper()) for label in command.positional)])
         names = list(dict.fromkeys(FLAG.findall(_help_text(read))))
-        message = explain(words, complaint.getvalue(), names, labels, flags.run_section if flags else "")
+        message = explain(words, complaint.getvalue(), names, usage, flags.run_section if flags else "")
         # A setting of a file is a flag that the user never typed: the file is to blame.
         blamed = FLAG.match(message)
         if blamed and blamed[0] in set(list_flags(complete)) - set(list_flags(words)):
