@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from rlftsim.errors import DataError
 from rlftsim.jobs.files import (
     append_text,
     errors_name,
+    list_folder,
     remove_folder,
     remove_temporaries,
     save_tensors,
@@ -247,3 +249,20 @@ save_tensors(Path(sys.argv[1]), tensors, {f"näme {i}": '"\\n' * i for i in rang
         subprocess.run([sys.executable, "-c", code, str(path)], check=True)
     assert len({path.read_bytes() for path in paths}) == 1
     assert load_file(paths[0])["t4"].tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("closed", "is_named"), [("lost+found", False), (".Trash-0", False), ("train", True)])
+def test_closed_folders_of_the_system_are_passed_over_and_no_other(closed, is_named, tmp_path, monkeypatch):
+    def scan(path, scandir=os.scandir):
+        if Path(path).name == closed:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scandir(path)
+
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "x").touch()
+    (tmp_path / closed).mkdir()
+    monkeypatch.setattr(os, "scandir", scan)
+    with pytest.raises(PermissionError) if is_named else nullcontext():
+        assert sorted(path.name for path in list_folder(tmp_path)) == sorted([closed, "a", "x"])
+    with pytest.raises(PermissionError):
+        list(list_folder(tmp_path / closed))

@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import NoReturn
 
 from safetensors.torch import save
 from torch import Tensor
@@ -112,17 +111,20 @@ def check_result_file(path: Path) -> None:
 
 
 def list_folder(folder: Path) -> Iterator[Path]:
-    """Yields files and folders in a folder and its subfolders; unlike `Path.rglob` passes over none that is closed.
+    """Yields files and folders in a folder and its subfolders; unlike `Path.rglob` passes over no closed data.
 
     Args:
         folder: Folder whose links to other folders are not followed.
 
     Raises:
-        OSError: A folder that cannot be listed, such as for lack of permission.
+        OSError: A folder that cannot be listed, such as for lack of permission, and is none of the system's.
     """
 
-    def stop(error: OSError) -> NoReturn:
-        raise error
+    def stop(error: OSError) -> None:
+        # such as .Trash-0 and lost+found, which a disk has beside data
+        is_of_system = Path(error.filename).name.startswith((".", "lost+found"))
+        if not is_of_system or Path(error.filename) == folder:
+            raise error
 
     for root, folders, files in os.walk(folder, onerror=stop):
         yield from map(Path(root).joinpath, (*folders, *files))
