@@ -322,9 +322,10 @@ def open_evaluation(
         is_shared = isinstance(runner, Share | Joining)
         rows = ScenarioRows(name, provenance, folder, scenario_ids, is_shared)
         with open_result(rows.result_path, rows, rows.read_finished, runner) as opened:
-            # groups of other shares, too: what cannot be joined is refused before hours of work
-            for group in rows.groups if is_shared and isinstance(opened, Lease) else ():
-                rows.read(group)
+            # What cannot be joined is refused before hours of work. The first stored group tells, as each share that
+            # wrote one was refused beside groups of others; to read thousands takes minutes.
+            if is_shared and isinstance(opened, Lease):
+                any(rows.read(group) is not None for group in rows.groups)
             yield rows, opened
 
 
