@@ -742,7 +742,7 @@ def test_comparing_an_evaluation_with_itself(evaluation, capsys):
 )
 def test_doctor_looks_at_everything(policy, way_out, capsys, monkeypatch):
     seconds = iter([1.0, 3.0])
-    monkeypatch.setattr("rlftsim.verbs.doctor._seconds_of_work", lambda: next(seconds))
+    monkeypatch.setattr("rlftsim.verbs.doctor.measure_work", lambda: next(seconds))
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     status, out, _ = run(capsys, "doctor")
     assert status in (0, 1)

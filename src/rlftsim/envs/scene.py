@@ -131,7 +131,7 @@ def build_env_scene(scenario: Scenario, num_steps: int) -> Scene:
     if scenario.ego_index not in rows:
         raise EpisodeFailure(
             f"scenario {scenario.scenario_id}: its ego, track {tracks.object_id[scenario.ego_index]}, is not valid at "
-            f"the current step ({CURRENT_STEP}) and cannot be driven: leave the scenario out or name another ego."
+            f"the current step ({CURRENT_STEP}) and cannot be driven: leave the scenario out."
         )
     steps = slice(min(scenario.num_steps, num_steps))
     states = np.zeros((len(rows), num_steps, 6))

@@ -307,6 +307,9 @@ class Evaluation:
 def find_column(name: str) -> str:
     """Column of a name or of a label of tables.
 
+    Args:
+        name: Name in `SCORE_COLUMNS`, or "RMM" as in tables.
+
     Raises:
         ConfigError: A column that no evaluation has; the message names the nearest one.
     """

@@ -45,7 +45,7 @@ def doctor(
     cores: int = 16,
     price: float = 0.04,
 ) -> int:
-    """Check this machine: versions, threads, GPU, disk, the embedded scenarios.
+    """Check this machine: versions, threads, GPU, SUMO, environments, disk, the embedded scenarios.
 
     Prints what to do about each problem. With --plan: measure how long work would take, how much memory, and on many
     machines what it would cost. The exit status is 1 if a check failed.
@@ -107,7 +107,7 @@ def _threads() -> Diagnosis:
     seconds = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
-        seconds.append(_seconds_of_work())
+        seconds.append(measure_work())
     torch.set_num_threads(num_threads)
     finding = f"{os.cpu_count()} cores, 2 threads take {seconds[1] / seconds[0]:.1f} times as long as 1"
     if seconds[1] <= 1.5 * seconds[0]:
@@ -117,7 +117,8 @@ def _threads() -> Diagnosis:
     return "threads", WARNING, f"{finding}: {way_out}"
 
 
-def _seconds_of_work() -> float:
+def measure_work() -> float:
+    """Seconds of some matrix products in as many threads as torch has."""
     # The first product is not timed: it starts the threads.
     x, w = torch.rand(4096, 64), torch.rand(64, 64)
     torch.relu(x @ w)
