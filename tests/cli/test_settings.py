@@ -152,6 +152,7 @@ BAD = [
     ([*FINETUNE, "--learning-rate", "1"], "did you mean .*--finetune.learning-rate or .*--gcsl.learning-rate"),
     ([*FINETUNE, "--gpus", "2"], "no flag --gpus: did you mean --processes"),
     ([*FINETUNE, "--method", "rlft", "--device", "cpu"], "did you mean --finetune.device.accelerator"),
+    (["experiment", "benchmark", "--pretrain.device", "cpu"], "did you mean --pretrain.device.accelerator"),
     ([*FINETUNE, "--resume", "runs/a"], "no flag --resume: what can be continued continues with the same"),
     (["evaluate", "--model", "demo-base"], "no flag --model: write the value .* as in `rlftsim evaluate MODEL`"),
     (["export", "page", "r", "--out", "o"], "no flag --out: write .* as in `rlftsim export FORMAT ROLLOUTS OUT`"),

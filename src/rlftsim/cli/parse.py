@@ -99,7 +99,7 @@ def nearest(flag: str, flags: Sequence[str], section: str = "") -> str | None:
         siblings = by_last[part]
         preferred = [name for name in (f"--{part}", f"--{section}.{part}") if name in siblings]
         return " or ".join(preferred[:1] or siblings)
-    members = [name for name in flags if f".{last}." in name]
+    members = [name for name in flags if name.startswith(f"--{group}") and f".{last}." in name]
     if members:
         return next((name for name in members if name.startswith(f"--{section}.")), members[0])
     if group and by_last:  # the group is right: a flag of another one would be a wild guess
