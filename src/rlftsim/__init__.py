@@ -57,7 +57,7 @@ _SYNONYMS = {
     **dict.fromkeys(("make", "make_vec"), 'gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)'),
     **dict.fromkeys(("train", "fit"), "pretrain or finetune"),
 }
-"""Names that people type first -> what they want."""
+"""Names that people type first -> those of the same meaning."""
 
 
 def __getattr__(name: str) -> Any:

@@ -115,9 +115,9 @@ def test_a_scenario_that_cannot_be_evaluated_is_named_with_the_reason():
 @pytest.mark.parametrize("sampling", [rs.Sampling(temperature=0.5), rs.Sampling(top_k=5)])
 @pytest.mark.parametrize("policy", ["oracle", "constant_velocity"])
 def test_sampling_is_refused_where_nothing_is_sampled(policy, sampling):
-    with pytest.raises(ConfigError, match=r"(temperature 0.5|top_k 5) has no effect: \w+ samples no decisions"):
+    with pytest.raises(ConfigError, match=r"(temperature 0.5|top_k 5) has no effect, as \w+ samples no decisions"):
         rs.evaluate(policy, scenes.straight_road(), sampling=sampling)
-    with pytest.raises(ConfigError, match="has no effect: ConstantVelocity samples no decisions"):
+    with pytest.raises(ConfigError, match="has no effect, as ConstantVelocity samples no decisions"):
         rs.simulate(ConstantVelocity(), scenes.straight_road(), num_rollouts=2, sampling=sampling)
 
 

@@ -217,7 +217,7 @@ class Study:
         return mean, mean * math.exp(-half), min(mean * math.exp(half) + hidden, 1.0)
 
     def describe_total(self) -> str:
-        """Events per 1 000 km and per hour driven, with interval; of a planner that stands still per hour alone."""
+        """Events per 1 000 km and per hour driven, with interval; of a standing planner per hour alone."""
         values, texts = self.mean_interval(), []
         # that an episode drives on average
         km = float(np.mean([s.pilot.driven_m for s in self.scenarios])) / 1000
@@ -268,7 +268,7 @@ def _errors_name_study(path: Path) -> Iterator[None]:
 
 
 def read_settings(path: Path) -> tuple[StudyConfig, int]:
-    """Settings of a study that was written, and the steps of its budget; 0 where an older version wrote it.
+    """Settings of a stored study, and the steps of the budget.
 
     Args:
         path: File that `Study.write` wrote.
@@ -279,7 +279,7 @@ def read_settings(path: Path) -> tuple[StudyConfig, int]:
     with _errors_name_study(path):
         about = parse_json(read_parquet_metadata(path)[b"rlftsim"], WAY_OUT, source=str(path))
         about["scenarios"] = about["scenarios"] and tuple(about["scenarios"])
-        budget = whole_number("budget", about.pop("budget", 0), 0)
+        budget = whole_number("budget", about.pop("budget"), 0)
         return StudyConfig(**about), budget
 
 

@@ -435,7 +435,7 @@ def build_report(
 
 
 def _note_row(evaluation: Evaluation, first: Evaluation) -> str:
-    """What the policy is, and the number of scenarios where it is not that of the first evaluation."""
+    """The note of a policy, and the number of scenarios where the first evaluation has more or fewer."""
     count = f"scenarios: {len(evaluation)}" if len(evaluation) != len(first) else ""
     return ", ".join(filter(None, [NOTES.get(evaluation.provenance.policy, ""), count]))
 

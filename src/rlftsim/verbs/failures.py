@@ -31,7 +31,7 @@ def failures(
     Splitting drives the planner again and again from the moments at which it came nearest to the event, with new dice:
     the estimates are unbiased, and every failure is a sample of the traffic model. Writes OUT/failures.parquet, a row
     per failing episode, and OUT/index.html. An interrupted call continues when the same command is repeated, and a
-    larger budget adds to a smaller one, but a smaller one or fewer scenarios never replace a result. With --share the
+    larger budget adds to a smaller, but fewer steps or scenarios never replace a result. With --share the
     first call does the pilot, and the same call again the rest. Needs the extra env: pip install 'rlftsim[env]'.
 
     Args:

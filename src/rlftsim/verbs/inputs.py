@@ -237,13 +237,13 @@ def check_sampling(policy: Policy | str, sampling: Sampling) -> None:
         sampling: Temperature and truncation of the decisions.
 
     Raises:
-        ConfigError: Either is set, and the policy samples nothing.
+        ConfigError: Either is set, and the policy samples no decisions.
     """
     if not sampling.is_full and (isinstance(policy, str) or not policy.noise_size):
         option = "top_k" if sampling.temperature == 1.0 else "temperature"
         name = policy if isinstance(policy, str) else type(policy).__name__
         raise ConfigError(
-            f"{option} {getattr(sampling, option):g} has no effect: {name} samples no decisions: leave it out."
+            f"{option} {getattr(sampling, option):g} has no effect, as {name} samples no decisions: leave it out."
         )
 
 
