@@ -104,9 +104,15 @@ def test_a_measurement_that_is_not_finite_changes_no_price():
 # ---- what is measured ------------------------------------------------------------------------------------------------
 
 
-def test_a_policy_that_is_the_reference_has_not_changed(vocabulary, batch, fabric):
+@pytest.mark.parametrize("probability", [0.0, 1.0], ids=["goal-free", "goals"])
+def test_a_policy_that_is_the_reference_has_not_changed(vocabulary, batch, fabric, probability):
     config = replace(CONFIG, constraints=("speed", "min_ade", "kinematic", "stops"))
-    learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
+    config = replace(config, goals=replace(config.goals, probability=probability))
+    policy = tiny.tiny_policy(vocabulary)
+    if probability:  # it has learned to see goals
+        policy = policy.with_goal_conditioning("concat")
+        torch.nn.init.normal_(policy.network.decoder.goal.out[-1].weight)
+    learner = prepare(policy, config, fabric.device)
     values = update_policy(learner, batch, config, fabric)
     assert [values[f"change_{name}"] for name in config.constraints] == [0.0] * 4
 

@@ -117,7 +117,7 @@ def most_realistic_ends(rollouts: Rollouts, realism: RealismResult) -> Float[Ten
 def measure_changes(
     learner: Any, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
 ) -> list[float]:
-    """Change of each constrained mean from the reference, which rolls out the same scenarios with the same noise.
+    """Change of each constrained mean from the reference, rolled out with the same scenarios, goals and noise.
 
     Args:
         learner: Policy, reference, and number of the update.
@@ -131,7 +131,10 @@ def measure_changes(
         batch, rollouts = experience.batch, experience.rollouts.select(slice(count))
         with fabric.autocast(), torch.no_grad(), one_thread():
             context = encode_like(learner.reference, batch, experience.context)
-            before = simulate(learner.reference, batch, num_rollouts=count, seed=seed, context=context, may_be_nan=True)
+            before = simulate(
+                learner.reference, batch, num_rollouts=count, seed=seed, context=context, goals=rollouts.goals,
+                may_be_nan=True,
+            )  # fmt: skip
         values, earlier = (measure_constraints(config.constraints, batch, r, config.metric) for r in (rollouts, before))
         change = values - earlier  # [C, B]
         sums += torch.stack([torch.where(change.isfinite(), change, 0.0).sum(1), change.isfinite().sum(1)])
