@@ -230,5 +230,5 @@ def test_the_direction_and_its_length_come_from_different_scenarios():
 
 def test_a_least_value_stays_without_any_rollout_but_the_least():
     parts = torch.tensor([[[1.0, 2.0], [4.0, 0.0], [5.0, 5.0]]])  # sums 3, 4, 10
-    credit = Constraint(lambda *_: parts, 0.1, is_minimum=True).credit(parts)
+    credit = Constraint("least", lambda *_: parts, 0.1, is_minimum=True).credit(parts)
     assert credit[0].tolist() == [[1.0 - 4.0, 2.0 - 0.0], [0.0, 0.0], [0.0, 0.0]]

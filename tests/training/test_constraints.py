@@ -185,6 +185,52 @@ def test_a_constraint_of_a_notebook_is_held_by_its_name(vocabulary, batch, fabri
         CONSTRAINTS.remove("turning")
 
 
+@pytest.fixture
+def register():
+    """Register a constraint "mine" of a function, and forget it after the test."""
+    yield lambda function, **settings: register_constraint("mine", tolerance=0.1, **settings)(function)
+    CONSTRAINTS.remove("mine")
+
+
+def share_evenly(batch, rollouts, agents):
+    return torch.full_like(rollouts.heading[..., 0], 0.25)
+
+
+@pytest.mark.parametrize(
+    ("function", "result"),
+    [
+        (lambda *_: share_evenly(*_).sum(-1), r"shape \[2, 4\]"),
+        (lambda *_: share_evenly(*_)[..., None], r"shape \[2, 4, 8, 1\]"),
+        (lambda *_: 0.5, "a float"),
+    ],
+)
+def test_shares_that_are_none_of_agents_are_refused(vocabulary, batch, fabric, register, function, result):
+    register(function)
+    config = replace(CONFIG, constraints=("mine",))
+    learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
+    with pytest.raises(
+        ConfigError, match=rf"constraint 'mine' of test_constraints gives {result}, expected \[2, 4, 8\]"
+    ):
+        update_policy(learner, batch, config, fabric)
+
+
+@pytest.mark.parametrize("convert", [torch.Tensor.bool, torch.Tensor.int], ids=["bool", "count"])
+def test_shares_may_be_truths_and_counts(vocabulary, batch, fabric, register, convert):
+    register(lambda batch, rollouts, agents: convert(rollouts.decision_mask.sum(-1)))
+    config = replace(CONFIG, constraints=("mine",))
+    learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
+    assert update_policy(learner, batch, config, fabric)["change_mine"] == 0.0
+
+
+def test_a_constraint_has_a_score_of_scenarios_and_a_name_of_its_own():
+    with pytest.raises(ConfigError, match=r"constraint 'mine': there is no score 'map': take one of meta_metric, kin"):
+        register_constraint("mine", tolerance=0.1, score="map")
+    for name in ("kl", "rmm", "length", "offroad_rate"):
+        with pytest.raises(ConfigError, match=f"constraint '{name}' has the name of a column that is measured"):
+            register_constraint(name, tolerance=0.1)(share_evenly)
+        assert CONSTRAINTS.find(name) is None
+
+
 @pytest.mark.parametrize("tolerance", [0.0, -1.0, math.nan])
 def test_a_tolerance_is_above_zero(tolerance):
     with pytest.raises(ConfigError, match="above 0"):

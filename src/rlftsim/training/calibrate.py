@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
 from rlftsim.realism import AgentScores, RealismResult, score_rollouts
+from rlftsim.realism.config import SUB_SCORES
 from rlftsim.rewards import compute_rewards, leave_one_out, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
@@ -33,14 +34,11 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios, list_scenario_ids
 from rlftsim.training.config import CONSTRAINED_MEANS, CalibrateConfig
-from rlftsim.training.constraints import check_constraints, constraint_by_name, credit_constraints
+from rlftsim.training.constraints import MEASURED, check_constraints, constraint_by_name, credit_constraints
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 
-SUB_SCORES = ("kinematic", "interactive", "map_based")
-MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
-"""Scores of the held-back scenarios, as `RealismResult` has them."""
 RIDGE = 1e-3
 """Part of the Fisher matrix's diagonal that is added to it, so that features that go together share a weight."""
 
@@ -288,7 +286,7 @@ class CalibrationLearner(Learner):
             batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, stage, fabric)
             values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
             rules = {name: constraint_by_name(name) for name in self.names[:-2] if name not in MEASURED}
-            values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in rules.items()}
+            values |= {name: rule.value(rule.split(batch, rollouts, agents)) for name, rule in rules.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
             rows[[positions.index(position) for position in batch_positions]] = torch.stack(
                 [values[name].double() for name in self.names], -1

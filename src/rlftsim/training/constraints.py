@@ -13,7 +13,7 @@ a change, see `Prices`. A constraint of a notebook or a separate package:
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -23,7 +23,8 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint, is_ours
-from rlftsim.realism import AgentScores, score_rollouts
+from rlftsim.realism import AgentScores, RealismResult, score_rollouts
+from rlftsim.realism.config import SUB_SCORES
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -32,6 +33,12 @@ from rlftsim.scenario.types import CURRENT_STEP, MOVING_M_S, STEP_S, STOP_M_S, S
 Direction = Literal["both", "rise", "fall"]
 Shares = Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
 
+SCORES = tuple(field.name for field in fields(RealismResult) if getattr(field.type, "dim_str", "") == "*B")
+"""Scores of a scenario that a constraint may take its value from."""
+MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
+"""Scores that calibration measures beside the constraints, as `RealismResult` has them."""
+TAKEN = frozenset((*MEASURED, "length", "kl", "num_decisions"))
+"""Names of what calibration measures: no constraint of another package has them."""
 RATE = 0.02
 """Growth of a price per update while a mean is off, as a fraction of the part that answers at once."""
 SHARE = 0.003
@@ -44,6 +51,7 @@ KEPT = 0.9
 class Constraint:
     """A sum over agents; fine-tuning holds the mean over rollouts, or the least value."""
 
+    name: str
     shares: Shares
     """Part of each agent in each rollout, to be summed over agents."""
     tolerance: float
@@ -54,6 +62,21 @@ class Constraint:
     """True = the value is that of the rollout with the least sum."""
     score: str = ""
     """Field of `RealismResult` that has the value; "" = the sum of the shares has."""
+
+    def split(self, batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores) -> Float64[Tensor, "B N A"]:
+        """Shares of the agents, see `credit_constraints` for the arguments.
+
+        Raises:
+            ConfigError: The function gives no tensor with a number for each agent in each rollout.
+        """
+        shares, shape = self.shares(batch, rollouts, agents), rollouts.heading.shape[:3]
+        if not isinstance(shares, Tensor) or shares.shape != shape:
+            result = f"shape {list(shares.shape)}" if isinstance(shares, Tensor) else f"a {type(shares).__name__}"
+            raise ConfigError(
+                f"constraint {self.name!r} of {self.shares.__module__} gives {result}, expected {list(shape)}: return "
+                "a tensor with each agent's share in each rollout [B, N, A]."
+            )
+        return shares.double()
 
     def value(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B"]:
         """Value in each scenario, by the shares."""
@@ -100,16 +123,20 @@ def register_constraint(
         score: Field of `RealismResult` that has the value, where shares have the differences between rollouts alone.
 
     Raises:
-        ConfigError: The name is that of a shipped constraint, or the tolerance is not above 0.
+        ConfigError: The name is that of a shipped constraint or of another measured column, the tolerance is not above
+            0, or there is no such score.
     """
     if not (math.isfinite(tolerance) and tolerance > 0):
         raise ConfigError(f"constraint {name!r}: tolerance is a finite number above 0, got {tolerance}.")
+    if score and score not in SCORES:
+        raise ConfigError(f"constraint {name!r}: there is no score {score!r}: take one of {', '.join(SCORES)}.")
 
     def register(function: Shares) -> Constraint:
         earlier = CONSTRAINTS.find(name)
         if earlier is not None and is_ours(earlier.shares) and not is_ours(function):
             raise ConfigError(f"constraint {name!r} ships with rlftsim: choose another name.")
-        constraint = Constraint(function, tolerance, forbidden, is_minimum, score)
+        constraint = Constraint(name, function, tolerance, forbidden, is_minimum, score)
+        _check_name(name, constraint)
         CONSTRAINTS.add(name, constraint, stacklevel=3)
         return constraint
 
@@ -120,14 +147,20 @@ def constraint_by_name(name: str) -> Constraint:
     """The constraint of a name, installed packages included.
 
     Raises:
-        ConfigError: Unknown, with the nearest registered name; or no constraint.
+        ConfigError: Unknown, with the nearest registered name; or no constraint; or a name of another measured column.
     """
     constraint = CONSTRAINTS.get(name)
     if not isinstance(constraint, Constraint):
         raise ConfigError(
             f"constraint {name!r} is of type {type(constraint).__name__}: decorate it with register_constraint."
         )
+    _check_name(name, constraint)
     return constraint
+
+
+def _check_name(name: str, constraint: Constraint) -> None:
+    if name in TAKEN and not is_ours(constraint.shares):
+        raise ConfigError(f"constraint {name!r} has the name of a column that is measured: choose another name.")
 
 
 def check_constraints(names: Sequence[str]) -> None:
@@ -154,7 +187,7 @@ def credit_constraints(
     decides = rollouts.decision_mask.any(-1)  # [B, N, A]
     credits = torch.zeros(len(names), *decides.shape, dtype=torch.float64, device=decides.device)
     for row, constraint in zip(credits, map(constraint_by_name, names)):
-        values = constraint.credit(constraint.shares(batch, rollouts, agents).double())
+        values = constraint.credit(constraint.split(batch, rollouts, agents))
         row.copy_(torch.where(decides, values.nan_to_num(), 0.0))
     return credits
 
@@ -173,7 +206,7 @@ def measure_constraints(
     realism, agents = score_rollouts(batch, rollouts, metric)
     values = torch.zeros(len(names), batch.num_scenarios, dtype=torch.float64, device=batch.device)
     for row, rule in zip(values, map(constraint_by_name, names)):
-        row.copy_(getattr(realism, rule.score) if rule.score else rule.value(rule.shares(batch, rollouts, agents)))
+        row.copy_(getattr(realism, rule.score) if rule.score else rule.value(rule.split(batch, rollouts, agents)))
     return values
 
 
