@@ -248,6 +248,31 @@ def test_a_feature_of_ones_own_works_by_its_name_and_its_shape_is_checked(base):
         FEATURES.remove("by_agent")
 
 
+@pytest.fixture
+def plugged_in(request):
+    register_feature("plugged_in", low=-1.0, high=1.0)(request.param)
+    yield ["plugged_in"]
+    FEATURES.remove("plugged_in")
+
+
+@pytest.mark.parametrize(
+    "plugged_in",
+    [lambda c: c.speed_change.double(), lambda c: c.speed_change > 0],
+    ids=["float64", "bool"],
+    indirect=True,
+)
+def test_a_feature_may_give_numbers_of_any_type(base, plugged_in):
+    logits = distribution_of(CalibratedPolicy(base, plugged_in, [1.0]), SCENES[0]).logits
+    assert logits.dtype == torch.float32
+    assert not torch.equal(logits, distribution_of(base, SCENES[0]).logits)
+
+
+@pytest.mark.parametrize("plugged_in", [lambda c: c.log_ratio / 0.0], indirect=True)  # -inf is clipped, 0 / 0 is not
+def test_a_feature_that_gives_nan_is_refused_by_its_name(base, plugged_in):
+    with pytest.raises(ConfigError, match="feature 'plugged_in' gives NaN for"):
+        distribution_of(CalibratedPolicy(base, plugged_in, [1.0]), SCENES[0])
+
+
 def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_what_it_earns(base, tmp_path):
     runs = []
     for eta, gain in ((0.2, 0.01), (0.4, 0.03)):

@@ -43,10 +43,10 @@ class Feature:
     high: float
 
     def __call__(self, candidates: Candidates) -> Float[Tensor, "P"]:
-        """Values of all pairs, within the bounds.
+        """Values of all pairs, within the bounds and of the type of the logits.
 
         Raises:
-            ConfigError: The function gives no tensor with a number for each pair.
+            ConfigError: The function gives no tensor with a number for each pair, or NaN.
         """
         values = self.compute(candidates)
         if not isinstance(values, Tensor) or values.shape != candidates.row.shape:
@@ -55,7 +55,13 @@ class Feature:
                 f"feature {self.name!r} gives {shape} for {len(candidates.row)} pairs of an agent and a token: return "
                 "a tensor with a number for each of them."
             )
-        return values.clamp(self.low, self.high)
+        values = values.to(candidates.log_ratio.dtype).clamp(self.low, self.high)
+        if not values.isfinite().all():
+            raise ConfigError(
+                f"feature {self.name!r} gives NaN for {int(values.isnan().sum())} of {len(values)} pairs of an agent "
+                "and a token: mend its divisions and roots, or calibrate without it."
+            )
+        return values
 
     def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
         """Other processes look the feature up by name: a function in a line is not pickled."""
