@@ -21,7 +21,7 @@ from rlftsim.training.calibrate import (
     t_value,
 )
 from rlftsim.training.config import FEATURES, CalibrateConfig
-from rlftsim.training.constraints import Constraint, constraint_by_name
+from rlftsim.training.constraints import CONSTRAINTS, Constraint, constraint_by_name, register_constraint
 from rlftsim.training.run import train_policy
 
 CONFIG = CalibrateConfig(
@@ -148,6 +148,19 @@ def test_a_calibration_says_what_each_feature_weighs_and_earns(policy, drawn_sce
     card = (model / "README.md").read_text()
     assert card.startswith("made by a test")
     assert "| speed_gap_under_2s |" in card
+
+
+def test_a_constraint_with_a_score_is_measured_by_it(policy, drawn_scenarios, tmp_path):
+    @register_constraint("ade", tolerance=0.1, score="average_displacement_error")
+    def ade(batch, rollouts, agents):
+        return -agents.displacement_error
+
+    try:
+        model = train_policy(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, constraints=("ade",)))
+    finally:
+        CONSTRAINTS.remove("ade")
+    base = json.loads((model / "calibration.json").read_text())["base"]
+    assert base["ade"] > 0
 
 
 def test_weights_of_the_network_stay_as_they_are(policy, drawn_scenarios, tmp_path):

@@ -286,7 +286,7 @@ class CalibrationLearner(Learner):
             batch, rollouts, recorder, realism, agents = self._roll_out(batch_positions, stage, fabric)
             values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
             rules = {name: constraint_by_name(name) for name in self.names[:-2] if name not in MEASURED}
-            values |= {name: rule.value(rule.split(batch, rollouts, agents)) for name, rule in rules.items()}
+            values |= {name: rule.measure(realism, batch, rollouts, agents) for name, rule in rules.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
             rows[[positions.index(position) for position in batch_positions]] = torch.stack(
                 [values[name].double() for name in self.names], -1

@@ -78,6 +78,21 @@ class Constraint:
             )
         return shares.double()
 
+    def measure(
+        self, realism: RealismResult, batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores
+    ) -> Float64[Tensor, "B"]:
+        """Value in each scenario: its score if it has any, else that of the shares, see `split`.
+
+        Args:
+            realism: Scores of the rollouts, a row per scenario.
+            batch: Scenarios with logged tracks.
+            rollouts: N rollouts of each scenario.
+            agents: Scores of the same rollouts, split over agents.
+        """
+        if self.score:
+            return getattr(realism, self.score).double()
+        return self.value(self.split(batch, rollouts, agents))
+
     def value(self, shares: Float[Tensor, "B N A"]) -> Float[Tensor, "B"]:
         """Value in each scenario, by the shares."""
         total = shares.sum(-1)
@@ -205,8 +220,8 @@ def measure_constraints(
     """
     realism, agents = score_rollouts(batch, rollouts, metric)
     values = torch.zeros(len(names), batch.num_scenarios, dtype=torch.float64, device=batch.device)
-    for row, rule in zip(values, map(constraint_by_name, names)):
-        row.copy_(getattr(realism, rule.score) if rule.score else rule.value(rule.split(batch, rollouts, agents)))
+    for row, constraint in zip(values, map(constraint_by_name, names)):
+        row.copy_(constraint.measure(realism, batch, rollouts, agents))
     return values
 
 
