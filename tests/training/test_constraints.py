@@ -237,6 +237,12 @@ def test_a_tolerance_is_above_zero(tolerance):
         register_constraint("never", tolerance=tolerance)
 
 
+def test_a_constraint_that_is_named_twice_is_refused(vocabulary, drawn_scenarios, tmp_path):
+    config = replace(CONFIG, constraints=("speed", "speed"))
+    with pytest.raises(ConfigError, match="constraints are different names, got speed, speed"):
+        train_policy(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+
+
 def test_goals_and_constraints_do_not_go_together():
     with pytest.raises(ConfigError, match="the speed that goals of reward"):
         replace(CONFIG, reward="gcft", goals=replace(CONFIG.goals, probability=1.0))

@@ -179,11 +179,13 @@ def _check_name(name: str, constraint: Constraint) -> None:
 
 
 def check_constraints(names: Sequence[str]) -> None:
-    """Check before a run that each name is that of a constraint.
+    """Check before a run that each name is that of a constraint, and none comes twice: it would halve the price.
 
     Raises:
-        ConfigError: As of `constraint_by_name`.
+        ConfigError: A repeated name, or the causes in `constraint_by_name`.
     """
+    if len(set(names)) < len(names):
+        raise ConfigError(f"constraints are different names, got {', '.join(names)}.")
     for name in names:
         constraint_by_name(name)
 
