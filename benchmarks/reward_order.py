@@ -30,8 +30,9 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.open import open_dataset
 from rlftsim.statistics import cluster_bootstrap
-from rlftsim.training.calibrate import CONSTRAINTS, Recorder, natural_direction
+from rlftsim.training.calibrate import Recorder, natural_direction
 from rlftsim.training.config import CONSTRAINED_MEANS, FEATURES, CalibrateConfig
+from rlftsim.training.constraints import constraint_by_name
 from rlftsim.training.data import batch_with_futures
 
 REWARDS = ("mloo", "rloo", "minade_rloo", "collision_offroad", "collision_offroad_ade")
@@ -122,7 +123,7 @@ def collect(
     scores, num_decisions, fisher = [], 0, torch.zeros(len(FEATURES), len(FEATURES), dtype=torch.float64)
     with progress_bar(f"rollouts {seed}", len(scenarios)) as advance:
         for index in range(len(scenarios)):
-            batch, recorder = batch_with_futures(scenarios, [index]), Recorder(needs_score=True)
+            batch, recorder = batch_with_futures(scenarios, [index]), Recorder(start=None)
             rollouts = simulate(policy, batch, num_rollouts=NUM_ROLLOUTS, seed=derive_seed(seed), choose=recorder)
             realism, agents = score_rollouts(batch, rollouts, "2025")
             decides = rollouts.decision_mask.any(-1)
@@ -133,7 +134,7 @@ def collect(
                     by_rollout = leave_one_out(rewards.total.double())[..., None].expand(decides.shape)
                     add(credits, BY_ROLLOUT, by_rollout, decides)
             for name in CONSTRAINED_MEANS:
-                constraint = CONSTRAINTS[name]
+                constraint = constraint_by_name(name)
                 shares = constraint.shares(batch, rollouts, agents).double()
                 add(credits, name, constraint.credit(shares), decides)
             scores.append(recorder.score.double())
@@ -168,7 +169,7 @@ def measure_kl(policy: CalibratedPolicy, scenarios: object, step: np.ndarray, se
     total, num_decisions = 0.0, 0
     for index in range(0, len(scenarios), max(len(scenarios) // NUM_MEASURED, 1)):
         batch: ScenarioBatch = batch_with_futures(scenarios, [index])
-        recorder = Recorder(needs_score=False)
+        recorder = Recorder(start=torch.zeros(len(FEATURES)))
         rollouts = simulate(
             calibrated, batch, num_rollouts=NUM_ROLLOUTS_MEASURED, seed=derive_seed(seed, "kl"), choose=recorder
         )

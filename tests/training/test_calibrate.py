@@ -1,5 +1,6 @@
 """Calibration: gradients without a backward pass, a step that leaves means as they are, and runs that resume."""
 
+import copy
 import itertools
 import json
 
@@ -13,6 +14,8 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
 from rlftsim.training.calibrate import (
     CalibrationLearner,
     best_length,
@@ -23,6 +26,7 @@ from rlftsim.training.calibrate import (
 from rlftsim.training.config import FEATURES, CalibrateConfig
 from rlftsim.training.constraints import CONSTRAINTS, Constraint, constraint_by_name, register_constraint
 from rlftsim.training.run import train_policy
+from rlftsim.training.run_folder import read_metrics
 
 CONFIG = CalibrateConfig(
     num_rollouts=3, batch_size=2, micro_batch_size=1, checkpoint_every=1, lengths=(1.0,), max_kl=1.0, device=tiny.CPU
@@ -207,6 +211,20 @@ def test_processes_change_no_gradient(vocabulary, drawn_scenarios, tmp_path):
         measured.append(measured_in(out))
     assert torch.equal(*(one["gradients"] for one in measured))
     torch.testing.assert_close(*(one["fisher"] for one in measured), rtol=1e-12, atol=0)
+
+
+def test_max_kl_bounds_the_distance_of_a_further_calibration_to_the_model_that_it_started_from(
+    policy, drawn_scenarios, tmp_path
+):
+    with torch.no_grad():
+        policy.eta.copy_(torch.linspace(-1.0, 1.0, len(policy.eta)))
+    start, batch = copy.deepcopy(policy), collate(drawn_scenarios)
+    train_policy(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, max_kl=0.001))
+    rollouts = simulate(policy, batch, num_rollouts=8, seed=3)
+    result, reference = (model.score(model.encode(batch), rollouts) for model in (policy, start))
+    kl = result.kl(reference).detach().sum() / rollouts.decision_mask.sum()
+    assert 0.0003 < kl < 0.0015  # on other rollouts than those of the run
+    assert [line["kl"] for line in read_metrics(tmp_path) if line.get("length") == 0.0] == [0.0]
 
 
 def test_the_policy_must_have_the_features_of_the_settings(policy, drawn_scenarios, tmp_path):

@@ -14,7 +14,7 @@ the signal of all weights of a network is not after tens of thousands. K feature
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -204,7 +204,7 @@ class CalibrationLearner(Learner):
         gains = scores["rmm"][1:] - scores["rmm"][0]  # [X, S]
         length = best_length(self.config.lengths, gains.T[np.isfinite(gains).all(0)])
         # KL grows with the square of the length: cut where the measured ones say so
-        per_length = max((kl - kls[0]) / tried**2 for kl, tried in zip(kls[1:], self.config.lengths))
+        per_length = max(kl / tried**2 for kl, tried in zip(kls[1:], self.config.lengths))
         length = min(length, math.sqrt(self.config.max_kl / per_length)) if per_length > 0 else length
         step = length * self.direction
         eta = self.start.double().cpu().numpy() + step
@@ -216,7 +216,7 @@ class CalibrationLearner(Learner):
         ]
         changes = []
         for row, (tried, kl) in enumerate(zip(self.config.lengths, kls[1:]), 1):
-            changes.append({"length": tried, "kl": float(kl - kls[0])})
+            changes.append({"length": tried, "kl": float(kl)})
             for name in self.names[:-2]:
                 change = scores[name][row] - scores[name][0]
                 changes[-1][name] = {"change": float(np.nanmean(change)), "t": t_value(change[np.isfinite(change)])}
@@ -303,7 +303,7 @@ class CalibrationLearner(Learner):
         """Scenarios of a stage, their rollouts with what was recorded, and the scores of these."""
         ids, purpose = (self.fitted_ids, "direction") if stage is None else (self.held_back_ids, "length")
         batch = batch_with_futures(self.scenarios, [ids[position] for position in positions]).to(fabric.device)
-        recorder = Recorder(needs_score=stage is None)
+        recorder = Recorder(start=None if stage is None else self.start)
         with fabric.autocast():
             rollouts = simulate(
                 self.policy, batch, num_rollouts=self.config.num_rollouts,
@@ -313,10 +313,10 @@ class CalibrationLearner(Learner):
 
 
 class Recorder:
-    """A `choose` of `simulate` that adds up the score function of the weights, or the KL to the base.
+    """A `choose` of `simulate` that adds up the score function of the weights, or the KL to the start of the run.
 
     Args:
-        needs_score: True = the score function, False = the KL.
+        start: Weights [K] of the model that the KL is measured to; None = the score function.
     """
 
     score: Any = 0.0
@@ -324,8 +324,8 @@ class Recorder:
     kl: Any = 0.0
     """[B], summed over decisions, nats."""
 
-    def __init__(self, *, needs_score: bool):
-        self.needs_score = needs_score
+    def __init__(self, *, start: Tensor | None):
+        self.start = start
 
     def __call__(self, distribution: Any, state: object, sampling: Any, noise: Tensor) -> Tensor:
         """Decisions [B, N, A], drawn as without a recorder.
@@ -337,10 +337,10 @@ class Recorder:
             noise: Uniform numbers of the draw.
         """
         decision = distribution.sample(sampling, noise)
-        if self.needs_score:
+        if self.start is None:
             self.score = self.score + distribution.score_function(decision)
         else:
-            self.kl = self.kl + distribution.kl(distribution.base).flatten(1).sum(1)
+            self.kl = self.kl + distribution.kl(replace(distribution, eta=self.start)).flatten(1).sum(1)
         return decision
 
 

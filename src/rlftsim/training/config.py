@@ -629,8 +629,8 @@ class CalibrateConfig:
     lengths: tuple[float, ...] = (0.7, 1.4)
     """Lengths that are tried on the scenarios held back; the best one on a parabola through their gains is taken."""
     max_kl: float = 0.005
-    """Largest measured KL of the result, nats per decision; a longer step is cut. What the constraints do not see grows
-    with its square, the gain hardly."""
+    """Largest measured KL of the result to the model that the run starts from, nats per decision; a longer step is cut.
+    What the constraints do not see grows with its square, the gain hardly."""
     held_back: float = 0.2
     """Fraction of the scenarios that chooses the length, and not the direction."""
     num_scenarios: int = 256
