@@ -16,7 +16,9 @@ from rlftsim.cli.main import main
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
+from rlftsim.policies.calibrated.features import FEATURES, register_feature
 from rlftsim.rewards.base import reward_by_name
+from rlftsim.training.constraints import CONSTRAINTS
 from rlftsim.verbs.plugins import POINTS
 
 ROOT = Path(__file__).parents[1]
@@ -143,6 +145,27 @@ def test_an_entry_point_cannot_take_the_name_of_a_shipped_thing(colors, install)
     assert colors.get("tau") != 3
     with pytest.warns(UserWarning, match="color 'tau' ships with rlftsim"):
         assert colors.names() == ["ours", "tau"]
+
+
+def test_a_package_decorates_what_its_entry_points_name_and_takes_no_shipped_name(tmp_path):
+    source = """
+from rlftsim.policies.calibrated.features import register_feature
+from rlftsim.training.constraints import register_constraint
+
+gap = register_constraint("gap", tolerance=1.0)(lambda batch, rollouts, agents: agents.collision)
+braking = register_feature("braking", low=-1.0, high=1.0)(lambda candidates: -candidates.speed_change)
+"""
+    entries = {"rlftsim.constraints": {"gap": "test_held:gap"}, "rlftsim.features": {"braking": "test_held:braking"}}
+    with third_party.installed(tmp_path / "site", "test_held", source, entries):
+        constraint, feature = CONSTRAINTS.get("gap"), FEATURES.get("braking")
+    try:
+        with pytest.raises(ConfigError, match="constraint 'speed' ships with rlftsim"):
+            CONSTRAINTS.add("speed", constraint)
+        with pytest.raises(ConfigError, match="feature 'speed_slow' ships with rlftsim"):
+            register_feature("speed_slow", low=-1.0, high=1.0)(feature.compute)
+    finally:
+        CONSTRAINTS.remove("gap")
+        FEATURES.remove("braking")
 
 
 def test_an_unknown_name_is_refused_with_the_nearest_one(colors):

@@ -183,7 +183,7 @@ class ExtensionPoint(Generic[Value]):
 
 
 def is_ours(value: object) -> bool:
-    """True for functions and classes that are defined in this package."""
+    """True for functions and classes that are defined in this package, and what is made of such a function."""
     return (getattr(value, "__module__", None) or "").partition(".")[0] == "rlftsim"
 
 

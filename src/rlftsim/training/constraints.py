@@ -63,6 +63,9 @@ class Constraint:
     score: str = ""
     """Field of `RealismResult` that has the value; "" = the sum of the shares has."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "__module__", self.shares.__module__)  # for `is_ours`: that of the function
+
     def split(self, batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores) -> Float64[Tensor, "B N A"]:
         """Shares of the agents, see `credit_constraints` for the arguments.
 
@@ -73,7 +76,7 @@ class Constraint:
         if not isinstance(shares, Tensor) or shares.shape != shape:
             result = f"shape {list(shares.shape)}" if isinstance(shares, Tensor) else f"a {type(shares).__name__}"
             raise ConfigError(
-                f"constraint {self.name!r} of {self.shares.__module__} gives {result}, expected {list(shape)}: return "
+                f"constraint {self.name!r} of {self.__module__} gives {result}, expected {list(shape)}: return "
                 "a tensor with each agent's share in each rollout [B, N, A]."
             )
         return shares.double()
@@ -147,9 +150,6 @@ def register_constraint(
         raise ConfigError(f"constraint {name!r}: there is no score {score!r}: take one of {', '.join(SCORES)}.")
 
     def register(function: Shares) -> Constraint:
-        earlier = CONSTRAINTS.find(name)
-        if earlier is not None and is_ours(earlier.shares) and not is_ours(function):
-            raise ConfigError(f"constraint {name!r} ships with rlftsim: choose another name.")
         constraint = Constraint(name, function, tolerance, forbidden, is_minimum, score)
         _check_name(name, constraint)
         CONSTRAINTS.add(name, constraint, stacklevel=3)
@@ -174,7 +174,7 @@ def constraint_by_name(name: str) -> Constraint:
 
 
 def _check_name(name: str, constraint: Constraint) -> None:
-    if name in TAKEN and not is_ours(constraint.shares):
+    if name in TAKEN and not is_ours(constraint):
         raise ConfigError(f"constraint {name!r} has the name of a column that is measured: choose another name.")
 
 

@@ -42,6 +42,9 @@ class Feature:
     low: float
     high: float
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "__module__", self.compute.__module__)  # for `is_ours`: that of the function
+
     def __call__(self, candidates: Candidates) -> Float[Tensor, "P"]:
         """Values of all pairs, within the bounds and of the type of the logits.
 
