@@ -273,6 +273,15 @@ def test_a_feature_that_gives_nan_is_refused_by_its_name(base, plugged_in):
         distribution_of(CalibratedPolicy(base, plugged_in, [1.0]), SCENES[0])
 
 
+@pytest.mark.parametrize("plugged_in", [lambda c: c.speed_change], indirect=True)
+def test_a_model_whose_feature_is_of_a_missing_package_says_so(base, plugged_in, tmp_path):
+    CalibratedPolicy(base, plugged_in).save_pretrained(tmp_path)
+    FEATURES.remove("plugged_in")
+    reason = r"do not fit CalibratedPolicy \(unknown feature 'plugged_in': .* once that is installed or imported"
+    with pytest.raises(CheckpointError, match=reason):
+        load_policy(tmp_path)
+
+
 def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_what_it_earns(base, tmp_path):
     runs = []
     for eta, gain in ((0.2, 0.01), (0.4, 0.03)):

@@ -71,7 +71,12 @@ class Feature:
         return find_feature, (self.name,)
 
 
-FEATURES = ExtensionPoint[Feature]("feature", "rlftsim.features", use=lambda name: features_by_name([name]))
+FEATURES = ExtensionPoint[Feature](
+    "feature",
+    "rlftsim.features",
+    use=lambda name: features_by_name([name]),
+    more="that of another package, once that is installed or imported",
+)
 """Features by name, this package's and others'."""
 
 

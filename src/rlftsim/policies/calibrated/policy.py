@@ -369,8 +369,8 @@ class CalibratedPolicy(nn.Module):
         """Policy of a model folder as written by `save_pretrained`.
 
         Raises:
-            ConfigError: There is no such folder, or a feature is not registered here.
-            CheckpointError: A file is missing, damaged or does not fit.
+            ConfigError: There is no such folder.
+            CheckpointError: A file is missing, damaged or does not fit, or a feature is not registered here.
         """
         stored = read_model(folder, architecture=cls.architecture)
         eta = stored.read_weights().get("eta")
@@ -379,7 +379,8 @@ class CalibratedPolicy(nn.Module):
         base = load_policy(f"{stored.folder / BASE}{os.sep}")
         path = stored.folder / CALIBRATION
         calibration = read_calibration(path) if path.exists() else {}
-        return stored.build(lambda features: cls(base, features, eta.tolist(), calibration))
+        settings = {"base": base, "eta": eta.tolist(), "calibration": calibration, **stored.config}
+        return replace(stored, config=settings).build(cls)
 
     # ---- the tilt -------------------------------------------------------------------------------------------------
 
