@@ -267,6 +267,32 @@ def test_what_its_users_refuse_is_listed_as_failing(tmp_path, capsys):
         assert re.search(things["rlftsim.experiments"][1], capsys.readouterr().err)
 
 
+def test_constraints_and_features_are_tried_out(tmp_path, capsys):
+    source = """
+from rlftsim.policies.calibrated.features import register_feature
+from rlftsim.training.constraints import register_constraint
+
+total = register_constraint("total", tolerance=1.0)(lambda batch, rollouts, agents: agents.collision.sum(-1))
+spare = register_constraint("spare", tolerance=1.0)(lambda batch, rollouts: agents.collision)
+shares = register_constraint("shares", tolerance=1.0)(lambda batch, rollouts, agents: agents.collision)
+zero = register_feature("zero", low=0.0, high=1.0)(lambda candidates: 0.0)
+slower = register_feature("slower", low=-1.0, high=1.0)(lambda candidates: -candidates.speed_change)
+"""
+    groups = {"rlftsim.constraints": ("total", "spare", "shares"), "rlftsim.features": ("zero", "slower")}
+    entries = {group: {name: f"test_trial:{name}" for name in names} for group, names in groups.items()}
+    with third_party.installed(tmp_path / "site", "test_trial", source, entries):
+        assert main(["plugins"]) == 1
+    text = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines()]
+    states = {row[1]: row[5] for row in rows if len(row) == 6}
+    expected = {"total": "fails", "spare": "fails", "shares": "works", "zero": "fails", "slower": "works"}
+    assert {name: states[name] for name in expected} == expected
+    text = " ".join(text.split())
+    assert "constraint 'total' of test_trial gives shape [2, 2], expected [2, 2, " in text
+    assert "constraint 'spare' fails (TypeError: <lambda>() takes 2 positional arguments but 3 were given" in text
+    assert "feature 'zero' gives float for " in text
+
+
 def test_without_plug_ins_the_groups_are_named(capsys):
     assert main(["plugins"]) == 0
     text = capsys.readouterr().out

@@ -168,13 +168,19 @@ class ExtensionPoint(Generic[Value]):
                 return str(error)
         return None
 
-    def describe_refusal(self, name: str) -> str | None:
-        """One line about a registered thing that is refused where it is used; None = it works."""
+    def describe_refusal(self, name: str, use: Callable[[str], object] | None = None) -> str | None:
+        """One line about a registered thing that is refused where it is used; None = it works.
+
+        Args:
+            name: Name of the thing.
+            use: Trial by name; None = the look-up of those who use it.
+        """
+        use = use or self._use
         # An entry point that is a module has a name of its own, under which there may be nothing.
-        if self._use is None or name not in self._registered:
+        if use is None or name not in self._registered:
             return None
         try:
-            self._use(name)
+            use(name)
         except ConfigError as error:
             return str(error)
         except (Exception, SystemExit) as error:

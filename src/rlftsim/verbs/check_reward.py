@@ -46,14 +46,14 @@ def check_reward(reward: "Reward | str", scenarios: Data | None = None) -> Check
         rewards[getattr(reward, "__name__", "reward")] = reward
     else:
         raise ConfigError(f"{in_short(reward)} is no reward: hand over a function, or the name of a registered one.")
-    batch = to_batch(_find_small_scenarios() if scenarios is None else scenarios)
+    batch = to_batch(find_small_scenarios() if scenarios is None else scenarios)
     goals = logged_goals(batch)
     rollouts = simulate(load_policy("demo-base", "cpu"), batch, num_rollouts=NUM_ROLLOUTS, seed=0, goals=goals)
     name = reward if isinstance(reward, str) else next(iter(rewards))
     return check_contract(name, rewards, splits, batch, rollouts)
 
 
-def _find_small_scenarios() -> list[Any]:
+def find_small_scenarios() -> list[Any]:
     """The scenario with the smallest map that ships, and the next one with a different number of agents."""
     data = open_dataset("synthetic", "validation")
     order = data.index["num_map_points"].to_numpy().argsort(kind="stable").tolist()

@@ -3,6 +3,7 @@
 import importlib
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from rich.table import Table
 
@@ -35,6 +36,8 @@ def try_plug_ins() -> Iterator[tuple[EntryPoint, str | None]]:
             try:
                 point = getattr(importlib.import_module(module), attribute)
                 problem = point.describe_problem(entry) or point.describe_refusal(entry.name)
+                if problem is None and group in TRIALS:
+                    problem = point.describe_refusal(entry.name, TRIALS[group])
                 if problem is None and group == "rlftsim.rewards":
                     problem = describe_failures(entry)
             except ConfigError as error:
@@ -59,12 +62,50 @@ def describe_failures(entry: EntryPoint) -> str | None:
     return None
 
 
+def try_constraint(name: str) -> None:
+    """Ask a constraint for its shares in rollouts of two small scenarios, as runs do.
+
+    Args:
+        name: Name of a registered constraint.
+    """
+    from rlftsim.policies.registry import load_policy  # imported late, with torch
+    from rlftsim.realism import score_rollouts
+    from rlftsim.rollout.simulate import simulate
+    from rlftsim.scenario.batch import collate
+    from rlftsim.training.constraints import constraint_by_name
+    from rlftsim.verbs.check_reward import find_small_scenarios
+
+    batch = collate(find_small_scenarios())
+    rollouts = simulate(load_policy("demo-base", "cpu"), batch, num_rollouts=2, seed=0)
+    constraint_by_name(name).split(batch, rollouts, score_rollouts(batch, rollouts, "2025")[1])
+
+
+def try_feature(name: str) -> None:
+    """Let a feature weigh in a second of two small scenarios, as in rollouts of calibration.
+
+    Args:
+        name: Name of a registered feature.
+    """
+    from rlftsim.policies.calibrated.policy import CalibratedPolicy  # imported late, with torch
+    from rlftsim.policies.registry import load_policy
+    from rlftsim.rollout.simulate import simulate
+    from rlftsim.scenario.batch import collate
+    from rlftsim.verbs.check_reward import find_small_scenarios
+
+    policy: Any = CalibratedPolicy(load_policy("demo-base", "cpu"), [name], eta=[1.0])
+    simulate(policy, collate(find_small_scenarios()), num_rollouts=1, seed=0, num_steps=10)
+
+
+TRIALS = {"rlftsim.constraints": try_constraint, "rlftsim.features": try_feature}
+"""Entry-point group -> trial by name; an error says what is wrong."""
+
+
 def plugins() -> int:
     """List what other installed packages add, with package and version, and the reason where one fails.
 
     Each is tried out, of rewards, policies, training methods, data sources, recipes, experiments, planners, trackers
-    and exporters: policies, planners and recipes are made, rewards are checked on two small scenarios. The exit status
-    is 1 if one fails. The others are used all the same.
+    and exporters: policies, planners and recipes are made, rewards, constraints and features are checked on two small
+    scenarios. The exit status is 1 if one fails. The others are used all the same.
     """
     plug_ins = list(try_plug_ins())
     if not plug_ins:
