@@ -282,9 +282,9 @@ def test_a_model_whose_feature_is_of_a_missing_package_says_so(base, plugged_in,
         load_policy(tmp_path)
 
 
-def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_what_it_earns(base, tmp_path):
+def calibrated_runs(base, *settings):
     runs = []
-    for eta, gain in ((0.2, 0.01), (0.4, 0.03)):
+    for eta, gain, changes in zip((0.2, 0.4), (0.01, 0.03), settings):
         row = {"feature": "speed_fast", "eta": eta, "t": 2.0} | dict.fromkeys(
             ("rmm", "kinematic", "interactive", "map_based"), gain
         )
@@ -293,7 +293,21 @@ def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_wh
             "num_scenarios": [8, 2], "num_rollouts": 8, "constraints": ["speed"], "length": 0.7, "features": [row],
             "held_back": [held_back],
         }  # fmt: skip
-        runs.append(CalibratedPolicy(base, ["speed_fast"], [eta], account))
+        runs.append(CalibratedPolicy(base, ["speed_fast"], [eta], account | changes))
+    return runs
+
+
+def test_the_mean_of_calibrations_says_only_what_is_true_of_all(base, tmp_path):
+    settings = {"reward": "mloo", "constraints": ["min_ade", "speed"], "num_rollouts": 4, "num_scenarios": [3, 1]}
+    average_policies(calibrated_runs(base, {"reward": "rloo"}, settings)).save_pretrained(tmp_path)
+    card = (tmp_path / "README.md").read_text()
+    assert "different numbers of scenarios with different numbers of rollouts each" in card
+    assert "by prediction: speed.\n" in card
+    assert load_policy(tmp_path).calibration["reward"] is None
+
+
+def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_what_it_earns(base, tmp_path):
+    runs = calibrated_runs(base, {}, {})
     average_policies(runs, base=base, scale=3.0).save_pretrained(tmp_path)
     average = load_policy(tmp_path)
     assert average.eta.tolist() == pytest.approx([0.9])

@@ -71,7 +71,8 @@ def calibration_table(calibration: Mapping[str, Any]) -> str:
     Args:
         calibration: Values of calibration.json, as `training.calibrate` writes these.
     """
-    num_fitted, num_held_back = calibration["num_scenarios"]
+    num_fitted, num_held_back = calibration["num_scenarios"] or (None, None)
+    scenarios, rollouts = _count(num_fitted, "scenario"), _count(calibration["num_rollouts"], "rollout")
     scores = ("rmm", "kinematic", "interactive", "map_based")
     features = [
         [row["feature"], f"{row['eta']:+.3f}", f"{row['t']:+.1f}", *(f"{row[name]:+.4f}" for name in scores)]
@@ -89,8 +90,8 @@ Measured on {num_held_back} scenarios that were held back, with t in parentheses
 """
     return f"""## Calibration
 
-What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {num_fitted} scenarios with
-{calibration["num_rollouts"]} rollouts each; t is that of its gradient over scenarios.
+What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {scenarios} with
+{rollouts} each; t is that of its gradient over scenarios.
 Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "nothing"}.
 
 {_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), features)}
@@ -100,7 +101,9 @@ Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "noth
 def average_calibrations(
     calibrations: Sequence[Mapping[str, Any]], scale: float, eta: Sequence[float]
 ) -> dict[str, Any]:
-    """Account of the mean of several calibrations, with means of the runs; empty where one of these has none.
+    """Account of the mean of several calibrations: means of the runs, and None for settings in which these differ.
+
+    It is empty where a run has none.
 
     Args:
         calibrations: Values of calibration.json of runs with the same features.
@@ -114,8 +117,15 @@ def average_calibrations(
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0] if name != "feature"}
         scaled = {name: mean if name == "t" else scale * mean for name, mean in means.items()}
         table.append({"feature": rows[0]["feature"], **scaled, "eta": weight})
+    first = calibrations[0]
+    shared = {name: value if all(c.get(name) == value for c in calibrations) else None for name, value in first.items()}
+    constraints = [name for name in first["constraints"] if all(name in c["constraints"] for c in calibrations)]
     # what the runs measured on scenarios held back is not true of the mean
-    return {**calibrations[0], "length": scale, "features": table, "held_back": []}
+    return {**shared, "constraints": constraints, "length": scale, "features": table, "held_back": []}
+
+
+def _count(number: int | None, noun: str) -> str:
+    return f"{'different numbers of' if number is None else number} {noun}{'' if number == 1 else 's'}"
 
 
 def _with_t(change: Mapping[str, float], style: str) -> str:
