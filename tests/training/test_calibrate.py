@@ -135,7 +135,8 @@ def test_the_length_is_the_top_of_the_parabola_and_none_that_was_not_tried(slope
 
 def test_a_t_value_is_the_mean_over_its_standard_error():
     assert t_value(np.array([1.0, 2.0, 3.0])) == pytest.approx(2 / (1 / np.sqrt(3)))
-    assert t_value(np.array([1.0])) == 0.0
+    assert t_value(np.array([1.0, 1.0])) == 0.0
+    assert t_value(np.array([1.0])) is None
 
 
 # ---- runs ----------------------------------------------------------------------------------------------------------
@@ -152,6 +153,8 @@ def test_a_calibration_says_what_each_feature_weighs_and_earns(policy, drawn_sce
     card = (model / "README.md").read_text()
     assert card.startswith("made by a test")
     assert "| speed_gap_under_2s |" in card
+    assert "Measured on 1 scenario that was held back, too few for a t." in card
+    assert "(+0.0)" not in card
 
 
 def test_a_constraint_with_a_score_is_measured_by_it(policy, drawn_scenarios, tmp_path):

@@ -393,7 +393,9 @@ def best_length(lengths: Sequence[float], gains: Float64[np.ndarray, "S X"]) -> 
     return float(tried.max()) if slope * tried.max() + bend * tried.max() ** 2 > 0 else 0.0
 
 
-def t_value(values: Float64[np.ndarray, "S"]) -> float:
-    """Mean of some scenarios over its standard error; 0 where all are equal, or for a single scenario."""
-    spread = values.std(ddof=1) if len(values) > 1 else 0.0
+def t_value(values: Float64[np.ndarray, "S"]) -> float | None:
+    """Mean of some scenarios over its standard error; 0 where all are equal, None for a single scenario."""
+    if len(values) < 2:
+        return None
+    spread = values.std(ddof=1)
     return float(values.mean() / (spread / np.sqrt(len(values)))) if spread > 0 else 0.0

@@ -306,6 +306,12 @@ def test_the_mean_of_calibrations_says_only_what_is_true_of_all(base, tmp_path):
     assert load_policy(tmp_path).calibration["reward"] is None
 
 
+def test_the_mean_with_a_calibration_that_has_no_t_has_none(base):
+    first, second = calibrated_runs(base, {}, {})
+    first.calibration["features"][0]["t"] = None
+    assert average_policies([first, second]).calibration["features"][0]["t"] is None
+
+
 def test_the_mean_of_calibrations_goes_further_from_their_plain_base_and_says_what_it_earns(base, tmp_path):
     runs = calibrated_runs(base, {}, {})
     average_policies(runs, base=base, scale=3.0).save_pretrained(tmp_path)

@@ -75,15 +75,18 @@ def calibration_table(calibration: Mapping[str, Any]) -> str:
     scenarios, rollouts = _count(num_fitted, "scenario"), _count(calibration["num_rollouts"], "rollout")
     scores = ("rmm", "kinematic", "interactive", "map_based")
     features = [
-        [row["feature"], f"{row['eta']:+.3f}", f"{row['t']:+.1f}", *(f"{row[name]:+.4f}" for name in scores)]
+        [row["feature"], f"{row['eta']:+.3f}", _format_t(row["t"]) or "–", *(f"{row[name]:+.4f}" for name in scores)]
         for row in sorted(calibration["features"], key=lambda row: -row["rmm"])
     ]
     lengths = [
         [f"{row['length']:g}", f"{row['kl']:.4f}", *(_with_t(row[name], style) for name, (_, style) in CHANGES.items())]
         for row in calibration["held_back"]
     ]
+    held_back = f"{num_held_back} scenarios that were held back, with t in parentheses"
+    if num_held_back == 1:
+        held_back = "1 scenario that was held back, too few for a t"
     measured = f"""
-Measured on {num_held_back} scenarios that were held back, with t in parentheses. The length taken is
+Measured on {held_back}. The length taken is
 {calibration["length"]:.2f}.
 
 {_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), lengths)}
@@ -114,9 +117,10 @@ def average_calibrations(
         return {}
     table = []
     for weight, rows in zip(eta, zip(*(calibration["features"] for calibration in calibrations))):
-        means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0] if name != "feature"}
-        scaled = {name: mean if name == "t" else scale * mean for name, mean in means.items()}
-        table.append({"feature": rows[0]["feature"], **scaled, "eta": weight})
+        names, ts = rows[0].keys() - {"feature", "eta", "t"}, [row["t"] for row in rows]
+        t = None if None in ts else sum(ts) / len(ts)  # a run of a single scenario has none
+        scaled = {name: scale * sum(row[name] for row in rows) / len(rows) for name in sorted(names)}
+        table.append({"feature": rows[0]["feature"], "eta": weight, "t": t, **scaled})
     first = calibrations[0]
     shared = {name: value if all(c.get(name) == value for c in calibrations) else None for name, value in first.items()}
     constraints = [name for name in first["constraints"] if all(name in c["constraints"] for c in calibrations)]
@@ -129,7 +133,13 @@ def _count(number: int | None, noun: str) -> str:
 
 
 def _with_t(change: Mapping[str, float], style: str) -> str:
-    return f"{change['change']:{style}} ({change['t']:+.1f})"
+    t = _format_t(change["t"])
+    return f"{change['change']:{style}}" + (f" ({t})" if t else "")
+
+
+def _format_t(value: float | None) -> str:
+    """A t-value; empty for that of a single scenario."""
+    return "" if value is None else f"{value:+.1f}"
 
 
 def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
