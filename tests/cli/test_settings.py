@@ -344,5 +344,7 @@ def test_a_recipe_without_a_method_has_no_flags_of_it_and_refuses_it(monkeypatch
     assert settings_of(["finetune", *words]).catk is None
     with pytest.raises(ConfigError, match=r"no flag --catk\.num-candidates"):
         parse(["finetune", *words, "--catk.num-candidates", "4", "--method", "catk"])
-    with pytest.raises(ConfigError, match=r"recipe without has no section catk: .* --method rlft"):
+    with pytest.raises(
+        ConfigError, match=r"recipe without has no section catk: .* any other model is trained by --method rlft"
+    ):
         parse(["finetune", *words, "--method", "catk"])

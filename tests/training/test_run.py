@@ -10,6 +10,7 @@ import tiny
 from rlftsim.errors import CheckpointError, ConfigError, NotYetError
 from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.runner import Inline
+from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.training import imitation
 from rlftsim.training.config import GcslConfig
@@ -82,6 +83,11 @@ def test_all_attributes_that_a_policy_lacks_are_named():
         check_trainable(torch.nn.Linear(1, 1), [None], "CAT-K", needs=("vocabulary",))
 
 
+def test_a_model_without_tokens_is_trained_by_rlft():
+    with pytest.raises(ConfigError, match="it has no vocabulary; fine-tune it by rlft, which needs no tokens"):
+        check_trainable(load_policy("trafficbots-base"), [None], "CAT-K", needs=("vocabulary",))
+
+
 def test_a_run_of_imitation_whose_gradients_are_lost_stops(vocabulary, drawn_scenarios, tmp_path, monkeypatch, capsys):
     original, calls = imitation.summed_loss, []
 
@@ -116,4 +122,6 @@ def test_a_run_that_ends_within_its_warmup_says_so(
 ):
     policy = tiny.tiny_policy(vocabulary)
     tiny.train("finetune", policy, drawn_scenarios[0], tmp_path, epochs=1.0, warmup_updates=warmup_updates)
-    assert (f"the run ends after 1 of {warmup_updates} warm-up updates" in capsys.readouterr().err) == is_warned
+    error = capsys.readouterr().err
+    assert (f"the run ends after 1 of {warmup_updates} warm-up updates" in error) == is_warned
+    assert ("raise epochs or max_updates, or lower warmup_updates where that can be set" in error) == is_warned

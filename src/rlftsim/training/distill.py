@@ -151,7 +151,10 @@ def check_teacher(teacher: Any) -> None:
         ConfigError: The policy has no vocabulary or no weights.
     """
     if not isinstance(teacher, TokenPolicy) or not isinstance(teacher, nn.Module):
-        raise ConfigError(f"a {type(teacher).__name__} has no vocabulary, so there are no tokens to distill.")
+        raise ConfigError(
+            f"a {type(teacher).__name__} has no vocabulary, so there are no tokens to distill: name a teacher that "
+            "chooses tokens, such as demo-tuned."
+        )
 
 
 def roll_out(

@@ -313,7 +313,9 @@ def check_trainable(
         needs = (*needs, *losses)  # a refusal names both
     missing = [attribute for attribute in (*needs, "save_pretrained") if not hasattr(policy, attribute)]
     if missing:
-        raise ConfigError(f"{name} cannot be trained with {method}: it has no {' and no '.join(missing)}.")
+        is_rlft_left = "vocabulary" in missing and "save_pretrained" not in missing
+        way_out = "; fine-tune it by rlft, which needs no tokens." if is_rlft_left else "."
+        raise ConfigError(f"{name} cannot be trained with {method}: it has no {' and no '.join(missing)}{way_out}")
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelled?")
     if is_rewarded:

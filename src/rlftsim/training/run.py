@@ -243,7 +243,7 @@ class TrainingRun:
         if self.num_updates < self.settings.warmup_updates and self.is_first:
             log.warning(
                 f"the run ends after {self.num_updates} of {self.settings.warmup_updates} warm-up updates, so its "
-                "weights hardly move: raise epochs or max_updates, or lower warmup_updates."
+                "weights hardly move: raise epochs or max_updates, or lower warmup_updates where that can be set."
             )
 
     def resume(self) -> None:

@@ -247,5 +247,8 @@ def _find_settings(recipe: Recipe, name: object, method: str) -> Any:
     """
     settings = getattr(recipe, find_section(method), None)
     if settings is None:
-        raise ConfigError(f"recipe {name} has no section {method}: name another recipe, or train by --method rlft.")
+        raise ConfigError(
+            f"recipe {name} has no section {method}: for a model with a vocabulary name another recipe, any "
+            "other model is trained by --method rlft."
+        )
     return settings

@@ -17,7 +17,13 @@ from rlftsim.policies.checkpoint import CARD, find_model, read_card, save_new_mo
 from rlftsim.policies.hub import FILES, push_files
 from rlftsim.policies.registry import POLICIES, load_policy, needs_no_arguments
 from rlftsim.policies.smart.alpasim_checkpoint import import_alpasim
-from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk, write_catk_vocabulary
+from rlftsim.policies.smart.catk_checkpoint import (
+    CatkImport,
+    export_catk,
+    import_catk,
+    write_catk,
+    write_catk_vocabulary,
+)
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import append_cards
 from rlftsim.recipes.docstrings import summarize_docstring
@@ -71,7 +77,8 @@ def export_model(model: str, out: Path, *, format: Format = "catk") -> None:
     policy = load_policy(model)
     if not isinstance(policy, SmartPolicy):
         raise ConfigError(
-            f"{model}: a {type(policy).__name__} cannot be exported, the public CAT-K code has SMART models alone."
+            f"{model}: a {type(policy).__name__} cannot be exported, the public CAT-K code has SMART models alone"
+            f"{_describe_base(model, policy)}."
         )
     tables = out.with_suffix(".vocabulary.npz")
     check_file(out)
@@ -160,6 +167,19 @@ def show_model(model: str) -> None:
     weights = sum(p.numel() for p in policy.parameters()) if isinstance(policy, nn.Module) else 0
     print_line(f"{model}: {type(policy).__name__}, {weights:,} weights")
     print_lines("\n" + (read_card(model, heading_shift=0) or "No card."))
+
+
+def _describe_base(model: str, policy: object) -> str:
+    """Where the SMART model is that a calibrated one has below its features; empty for all others.
+
+    Raises:
+        CheckpointError: That model cannot be exported either.
+    """
+    base = getattr(policy, "base", None)
+    if not isinstance(base, SmartPolicy):
+        return ""
+    export_catk(base)
+    return f": export {find_model(model) / 'base'}, which is this model without the features"
 
 
 def _check_empty(folder: Path) -> None:
