@@ -169,11 +169,11 @@ class ExtensionPoint(Generic[Value]):
         return None
 
     def describe_refusal(self, name: str, use: Callable[[str], object] | None = None) -> str | None:
-        """One line about a registered thing that is refused where it is used; None = it works.
+        """One line about a registered thing that is refused where users need the thing; None = no refusal.
 
         Args:
             name: Name of the thing.
-            use: Trial by name; None = the look-up of those who use it.
+            use: Trial by name; None = the look-up of a run.
         """
         use = use or self._use
         # An entry point that is a module has a name of its own, under which there may be nothing.
@@ -189,7 +189,7 @@ class ExtensionPoint(Generic[Value]):
 
 
 def is_ours(value: object) -> bool:
-    """True for functions and classes that are defined in this package, and what is made of such a function."""
+    """True for functions and classes that are defined in this package, and for features and constraints of these."""
     return (getattr(value, "__module__", None) or "").partition(".")[0] == "rlftsim"
 
 

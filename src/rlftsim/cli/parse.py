@@ -56,7 +56,7 @@ def explain(words: Sequence[str], complaint: str, flags: Sequence[str], usage: s
         words: Words behind the verb.
         complaint: Output of tyro, a box of lines.
         flags: Flags of the verb.
-        usage: Command with the words that have no flag, such as "evaluate MODEL".
+        usage: Command with all words without a flag, such as "evaluate MODEL".
         section: Section whose settings count, such as that of the method in force; empty without sections.
     """
     for flag in list_flags(words):

@@ -15,6 +15,7 @@ from rlftsim.realism.config import (
     METRICS,
     SCENARIO_GEN,
     SIM_AGENTS,
+    SUB_SCORES,
     Challenge,
     MetricConfig,
     metric_by_name,
@@ -34,8 +35,9 @@ from rlftsim.realism.meta_metric import (
 
 __all__ = [
     "FEATURE_NAMES", "METRICS", "METRIC_2023", "METRIC_2024", "METRIC_2024_ORIGINAL", "METRIC_2025",
-    "METRIC_2025_SCENARIO_GEN", "SCENARIO_GEN", "SIM_AGENTS", "AgentScores", "Challenge", "ComputeConfig", "Credit",
-    "Features", "MetricConfig", "RealismResult", "ScenarioFeatures", "ScenarioLog", "SimulatedStates",
-    "compute_batch_features", "compute_credit", "compute_features", "compute_single_credit", "metric_by_name",
-    "scenario_log", "score", "score_batch", "score_batch_features", "score_features", "score_rollouts",
+    "METRIC_2025_SCENARIO_GEN", "SCENARIO_GEN", "SIM_AGENTS", "SUB_SCORES", "AgentScores", "Challenge",
+    "ComputeConfig", "Credit", "Features", "MetricConfig", "RealismResult", "ScenarioFeatures", "ScenarioLog",
+    "SimulatedStates", "compute_batch_features", "compute_credit", "compute_features", "compute_single_credit",
+    "metric_by_name", "scenario_log", "score", "score_batch", "score_batch_features", "score_features",
+    "score_rollouts",
 ]  # fmt: skip

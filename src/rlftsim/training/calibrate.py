@@ -25,8 +25,7 @@ from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.progress import log
-from rlftsim.realism import AgentScores, RealismResult, score_rollouts
-from rlftsim.realism.config import SUB_SCORES
+from rlftsim.realism import SUB_SCORES, AgentScores, RealismResult, score_rollouts
 from rlftsim.rewards import compute_rewards, leave_one_out, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate

@@ -23,8 +23,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint, is_ours
-from rlftsim.realism import AgentScores, RealismResult, score_rollouts
-from rlftsim.realism.config import SUB_SCORES
+from rlftsim.realism import SUB_SCORES, AgentScores, RealismResult, score_rollouts
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -34,11 +33,11 @@ Direction = Literal["both", "rise", "fall"]
 Shares = Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
 
 SCORES = tuple(field.name for field in fields(RealismResult) if getattr(field.type, "dim_str", "") == "*B")
-"""Scores of a scenario that a constraint may take its value from."""
+"""Scores of a scenario that may be the value of a constraint."""
 MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
 """Scores that calibration measures beside the constraints, as `RealismResult` has them."""
 TAKEN = frozenset((*MEASURED, "length", "kl", "num_decisions"))
-"""Names of what calibration measures: no constraint of another package has them."""
+"""Columns that calibration measures, no names for constraints of packages."""
 RATE = 0.02
 """Growth of a price per update while a mean is off, as a fraction of the part that answers at once."""
 SHARE = 0.003
@@ -84,7 +83,7 @@ class Constraint:
     def measure(
         self, realism: RealismResult, batch: ScenarioBatch, rollouts: Rollouts, agents: AgentScores
     ) -> Float64[Tensor, "B"]:
-        """Value in each scenario: its score if it has any, else that of the shares, see `split`.
+        """Value in each scenario: the score, or without a score the value of the shares, see `split`.
 
         Args:
             realism: Scores of the rollouts, a row per scenario.
@@ -141,8 +140,8 @@ def register_constraint(
         score: Field of `RealismResult` that has the value, where shares have the differences between rollouts alone.
 
     Raises:
-        ConfigError: The name is that of a shipped constraint or of another measured column, the tolerance is not above
-            0, or there is no such score.
+        ConfigError: The name of a shipped constraint or of a measured column, a tolerance that is not above 0, or an
+            unknown score.
     """
     if not (math.isfinite(tolerance) and tolerance > 0):
         raise ConfigError(f"constraint {name!r}: tolerance is a finite number above 0, got {tolerance}.")
@@ -162,7 +161,7 @@ def constraint_by_name(name: str) -> Constraint:
     """The constraint of a name, installed packages included.
 
     Raises:
-        ConfigError: Unknown, with the nearest registered name; or no constraint; or a name of another measured column.
+        ConfigError: Unknown, with the nearest registered name; or no constraint; or the name of a measured column.
     """
     constraint = CONSTRAINTS.get(name)
     if not isinstance(constraint, Constraint):
