@@ -318,7 +318,7 @@ WRONG = {
     ),
     "top-k of a policy without categories": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --top-k 3",
-        "top_k=3 needs a policy with categories",
+        "top_k 3 has no effect, as ConstantVelocity samples no decisions",
     ),
     "goals of a policy that has none": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --goals {tmp}/goals.json",

@@ -40,7 +40,7 @@ def test_ctrl_c_of_the_terminal_is_no_matter_of_ffmpeg(tmp_path, capfd):
         os.kill(int(process), signal.SIGINT)
         yield np.zeros((64, 64, 3), np.uint8)
 
-    find_writer(tmp_path / "film.mp4")(tmp_path / "film.mp4", frames(), 10)
+    find_writer(tmp_path / "film.mp4")(tmp_path / "film.mp4", frames(), 10.0)
     assert len(read_mp4(tmp_path / "film.mp4")[1]) == 2
     assert capfd.readouterr().err == ""
 

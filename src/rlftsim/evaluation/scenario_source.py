@@ -61,8 +61,10 @@ def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> list[s
     steps = dataset.index["num_steps"].to_pylist()
     short = [i for i in positions if steps[i] < TOTAL_STEPS]
     if short:
+        # scenarios in memory lie in a temporary folder, without a split
+        title = f"{dataset.folder} (split {dataset.split}): " if dataset.split else ""
         raise DataError(
-            f"{len(short)} of {len(positions)} scenarios withhold their future, the first is "
+            f"{title}{len(short)} of {len(positions)} scenarios withhold their future, the first is "
             f"{dataset.scenario_ids[short[0]]} with {steps[short[0]]} steps: a test split can be simulated but not "
             "evaluated, use training or validation data."
         )

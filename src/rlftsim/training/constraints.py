@@ -13,7 +13,7 @@ a change, see `Prices`. A constraint of a notebook or a separate package:
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -32,7 +32,10 @@ from rlftsim.scenario.types import CURRENT_STEP, MOVING_M_S, STEP_S, STOP_M_S, S
 Direction = Literal["both", "rise", "fall"]
 Shares = Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
 
-SCORES = tuple(field.name for field in fields(RealismResult) if getattr(field.type, "dim_str", "") == "*B")
+SCORES = (
+    *("meta_metric", *SUB_SCORES, "average_displacement_error", "min_average_displacement_error", "collision_rate"),
+    *("offroad_rate", "unlogged_offroad_rate", "traffic_light_violation_rate"),
+)
 """Scores of a scenario that may be the value of a constraint."""
 MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
 """Scores that calibration measures beside the constraints, as `RealismResult` has them."""
