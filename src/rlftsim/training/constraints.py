@@ -33,8 +33,9 @@ Direction = Literal["both", "rise", "fall"]
 Shares = Callable[[ScenarioBatch, Rollouts, AgentScores], Float[Tensor, "B N A"]]
 
 SCORES = (
-    *("meta_metric", *SUB_SCORES, "average_displacement_error", "min_average_displacement_error", "collision_rate"),
-    *("offroad_rate", "unlogged_offroad_rate", "traffic_light_violation_rate"),
+    *("meta_metric", "kinematic", "interactive", "map_based", "average_displacement_error"),
+    *("min_average_displacement_error", "collision_rate", "offroad_rate", "unlogged_offroad_rate"),
+    "traffic_light_violation_rate",
 )
 """Scores of a scenario that may be the value of a constraint."""
 MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
