@@ -135,8 +135,7 @@ def collect(
                     add(credits, BY_ROLLOUT, by_rollout, decides)
             for name in CONSTRAINED_MEANS:
                 constraint = constraint_by_name(name)
-                shares = constraint.shares(batch, rollouts, agents).double()
-                add(credits, name, constraint.credit(shares), decides)
+                add(credits, name, constraint.credit(constraint.split(batch, rollouts, agents)), decides)
             scores.append(recorder.score.double())
             flat = scores[-1].flatten(0, 2)
             fisher += flat.T @ flat

@@ -112,10 +112,9 @@ def parse(words: Sequence[str]) -> Any:
         SystemExit: They ask for help, which has been printed.
     """
     if words[0] not in (*VERBS, JOIN):
-        matches = (
-            [SYNONYMS[words[0]]] if words[0] in SYNONYMS else difflib.get_close_matches(words[0], [*VERBS, JOIN], 1)
-        )
-        hint = f"did you mean {matches[0]}?" if matches else f"known are {', '.join([*VERBS, JOIN])}."
+        verbs = [*VERBS, JOIN]
+        match = SYNONYMS.get(words[0]) or next(iter(difflib.get_close_matches(words[0], verbs, 1)), None)
+        hint = f"did you mean {match}?" if match else f"known are {', '.join(verbs)}."
         raise ConfigError(f"no verb {in_short(words[0])}: {hint}")
     for word in words:
         if not word.strip():

@@ -55,14 +55,14 @@ def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> list[s
         DataError: No scenario, or a scenario without a future.
     """
     positions = range(min(len(dataset), config.limit or len(dataset)))
+    split = f" (split {dataset.split})" if dataset.split else ""
     if not positions:
-        split = f" (split {dataset.split})" if dataset.split else ""
         raise DataError(f"{dataset.folder}{split} has no scenarios: nothing to evaluate.")
     steps = dataset.index["num_steps"].to_pylist()
     short = [i for i in positions if steps[i] < TOTAL_STEPS]
     if short:
         # scenarios in memory lie in a temporary folder, without a split
-        title = f"{dataset.folder} (split {dataset.split}): " if dataset.split else ""
+        title = f"{dataset.folder}{split}: " if split else ""
         raise DataError(
             f"{title}{len(short)} of {len(positions)} scenarios withhold their future, the first is "
             f"{dataset.scenario_ids[short[0]]} with {steps[short[0]]} steps: a test split can be simulated but not "

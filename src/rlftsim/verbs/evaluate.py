@@ -99,7 +99,7 @@ def evaluate(
         split: Split of the data set; None = all scenarios. An opened data set has its own.
         device: Device of a model that is loaded; several processes (--jobs) need cpu.
         guidance_scale: Factor on the goal-progress bias of the logits, with --goals logged; above 1 goals count more.
-        rollouts_per_pass: Rollouts simulated together. Bounds memory, changes no result; small models like 32.
+        rollouts_per_pass: Rollouts simulated together. Bounds memory, changes no result; 32 suit small models best.
         work: Machines that share the work.
 
     Returns:

@@ -25,24 +25,33 @@ POINTS = {
     "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",
 }
 """Entry-point group -> module and name of its `ExtensionPoint`."""
+TRIALS = {
+    "rlftsim.features": "rlftsim.verbs.plugin_trials:try_feature",
+    "rlftsim.constraints": "rlftsim.verbs.plugin_trials:try_constraint",
+}
+"""Entry-point group -> module and name of a trial by name, with torch; an error says what is wrong."""
 
 
 def try_plug_ins() -> Iterator[tuple[EntryPoint, str | None]]:
     """Entry points of installed packages in all groups, and the reason where one cannot be used: each is tried out."""
     for group, location in POINTS.items():
         for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
-            module, _, attribute = location.partition(":")
             # The group itself may need an extra that is not installed.
             try:
-                point = getattr(importlib.import_module(module), attribute)
+                point = _load(location)
                 problem = point.describe_problem(entry) or point.describe_refusal(entry.name)
                 if problem is None and group in TRIALS:
-                    problem = point.describe_refusal(entry.name, TRIALS[group])
+                    problem = point.describe_refusal(entry.name, _load(TRIALS[group]))
                 if problem is None and group == "rlftsim.rewards":
                     problem = describe_failures(entry)
             except ConfigError as error:
                 problem = str(error)
             yield entry, problem
+
+
+def _load(location: str) -> Any:
+    module, _, attribute = location.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def describe_failures(entry: EntryPoint) -> str | None:
@@ -60,44 +69,6 @@ def describe_failures(entry: EntryPoint) -> str | None:
             broken = "; ".join(f"{failure.rule}: {failure.detail}" for failure in failures)
             return f"reward {name!r} of {entry.value} breaks the contract, see rs.check_reward: {broken}."
     return None
-
-
-def try_constraint(name: str) -> None:
-    """Ask a constraint for its shares in rollouts of two small scenarios, as runs do.
-
-    Args:
-        name: Name of a registered constraint.
-    """
-    from rlftsim.policies.registry import load_policy  # imported late, with torch
-    from rlftsim.realism import score_rollouts
-    from rlftsim.rollout.simulate import simulate
-    from rlftsim.scenario.batch import collate
-    from rlftsim.training.constraints import constraint_by_name
-    from rlftsim.verbs.check_reward import find_small_scenarios
-
-    batch = collate(find_small_scenarios())
-    rollouts = simulate(load_policy("demo-base", "cpu"), batch, num_rollouts=2, seed=0)
-    constraint_by_name(name).split(batch, rollouts, score_rollouts(batch, rollouts, "2025")[1])
-
-
-def try_feature(name: str) -> None:
-    """Let a feature weigh in a second of two small scenarios, as in rollouts of calibration.
-
-    Args:
-        name: Name of a registered feature.
-    """
-    from rlftsim.policies.calibrated.policy import CalibratedPolicy  # imported late, with torch
-    from rlftsim.policies.registry import load_policy
-    from rlftsim.rollout.simulate import simulate
-    from rlftsim.scenario.batch import collate
-    from rlftsim.verbs.check_reward import find_small_scenarios
-
-    policy: Any = CalibratedPolicy(load_policy("demo-base", "cpu"), [name], eta=[1.0])
-    simulate(policy, collate(find_small_scenarios()), num_rollouts=1, seed=0, num_steps=10)
-
-
-TRIALS = {"rlftsim.constraints": try_constraint, "rlftsim.features": try_feature}
-"""Entry-point group -> trial by name; an error says what is wrong."""
 
 
 def plugins() -> int:
