@@ -16,7 +16,6 @@ from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.model_specs import CATK, FineTuned, finetune_config, over_seeds
 from rlftsim.experiments.paper import (
     benchmark,
-    credit,
     finetune_curve,
     kl_frontier,
     model_agnosticism,
@@ -179,8 +178,8 @@ def test_the_ablation_says_how_far_each_reward_went(suite):
 
 def test_columns_in_percent_and_metres_are_the_evaluations_own(suite):
     columns = {"collision_rate": [0.1, 0.3], "average_displacement_error": [2.0, 3.0]}
-    measured = {name: row(name, [0.5, 0.6], **columns) for name in ("base", *credit.COMPARED)}
-    found = credit.summarize(measured, suite)
+    measured = {name: row(name, [0.5, 0.6], **columns) for name in ("base", *reward_ablation.REWARDS)}
+    found = reward_ablation.summarize(measured, suite)
     assert cell(found, "base", "collision") == "20.00 ± 10.00"
     assert cell(found, "base", "ADE") == "2.50 ± 0.50"
 

@@ -115,8 +115,9 @@ def test_a_policy_of_another_package_is_fine_tuned_and_compared(tmp_path, capsys
         POLICIES.get("paced")().save_pretrained(tmp_path / "paced")
         settings = ["--finetune.epochs", "0.01", "--finetune.batch-size", "1", "--finetune.num-rollouts", "2"]
         settings += ["--finetune.device.accelerator", "cpu", "--finetune.goals.learning-rate-scale", "1"]
-        words = ["experiment", "credit", "--base-model", str(tmp_path / "paced"), "--out", str(out), "--device", "cpu"]
-        assert main([*words, "--seeds", "1", "--limit", "2", "--num-rollouts", "4", "--jobs", "1", *settings]) == 0
+        words = ["experiment", "reward-ablation", "--base-model", str(tmp_path / "paced"), "--out", str(out)]
+        words += ["--device", "cpu", "--seeds", "1", "--limit", "2", "--num-rollouts", "4", "--jobs", "1"]
+        assert main([*words, *settings]) == 0
     assert "MLOO against base, 2 scenarios of 1 cluster in both" in capsys.readouterr().out
     tuned = json.loads((out / "runs" / "mloo-seed0" / "0.01-epochs" / "model" / "config.json").read_text())
     assert tuned["architecture"] == "paced"

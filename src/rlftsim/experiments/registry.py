@@ -11,7 +11,7 @@ from rlftsim.experiments.results import Experiment
 from rlftsim.plugins import ExtensionPoint
 
 PAPER = (
-    *("benchmark", "reward-ablation", "paired-ttest", "variance-scaling", "finetune-curve", "oracle", "credit"),
+    *("benchmark", "reward-ablation", "paired-ttest", "variance-scaling", "finetune-curve", "oracle"),
     *("model-agnosticism", "kl-frontier"),
     *("qualitative", "goal-conditioning", "kinematic-controllability", "maneuver-controllability"),
 )

@@ -35,17 +35,8 @@ FINAL_PERCENT = 20
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
     """Rows of the base model and of a fine-tuning with each reward."""
-    return evaluate_rewards(suite, tuple(REWARDS))
-
-
-def evaluate_rewards(suite: ExperimentSuite, names: Sequence[str]) -> dict[str, Row]:
-    """Rows of the base model and of fine-tunings with some of `REWARDS`, in this order.
-
-    Args:
-        suite: Suite that trains and evaluates what is missing, with as many seeds as the suite has.
-        names: Names of the rewards, keys of `REWARDS`.
-    """
-    return suite.evaluate({REFERENCE: (BASE,), **{name: over_seeds(REWARDS[name], suite.num_seeds) for name in names}})
+    tuned = {name: over_seeds(spec, suite.num_seeds) for name, spec in REWARDS.items()}
+    return suite.evaluate({REFERENCE: (BASE,), **tuned})
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
