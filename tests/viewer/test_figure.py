@@ -2,22 +2,9 @@ import re
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
-from matplotlib.patches import Rectangle
 
 from rlftsim.errors import DataError
-from rlftsim.viewer.figure import (  # fmt: skip
-    BETTER_COLOR,
-    COLORS,
-    EQUAL_COLOR,
-    WORSE_COLOR,
-    Band,
-    Interval,
-    draw_bands,
-    draw_intervals,
-    draw_verdicts,
-    save_figure,
-)
+from rlftsim.viewer.figure import COLORS, Band, Interval, draw_bands, draw_intervals, save_figure
 from rlftsim.viewer.page import read_asset
 
 X = np.array([2.0, 4.0, 8.0])
@@ -67,11 +54,3 @@ def test_the_first_interval_is_on_top_and_zero_is_marked_for_differences():
     assert [label.get_text() for label in axis.get_yticklabels()] == ["first", "second"]
     assert len(axis.lines) == 5
     assert len(draw_intervals(items, title="t", x_label="score", zero=False).axes[0].lines) == 4
-
-
-def test_verdicts_are_signs_and_colors_and_the_diagonal_is_empty():
-    verdicts = np.array([[0, 1, 0], [-1, 0, 1], [0, -1, 0]])
-    axis = draw_verdicts(["a", "b", "c"], verdicts, title="t", note="n").axes[0]
-    assert [text.get_text() for text in axis.texts] == ["", "+", "~", "−", "", "+", "~", "−", ""]
-    colors = [to_hex(p.get_facecolor()) for p in axis.patches if isinstance(p, Rectangle)]
-    assert [colors[i] for i in (1, 2, 3)] == [BETTER_COLOR, EQUAL_COLOR, WORSE_COLOR]

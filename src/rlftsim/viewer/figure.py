@@ -1,4 +1,4 @@
-"""Figures as PNG or SVG: curves with bands, intervals beside each other, verdicts in a matrix, charts of pages."""
+"""Figures as PNG or SVG: curves with bands, intervals beside each other, charts of pages."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,11 +7,10 @@ from typing import Literal
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
 from rlftsim.errors import ConfigError
@@ -21,7 +20,6 @@ from rlftsim.viewer.chart import Chart
 COLORS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
 """Colors of curves; the first four are those of `palette.css`, in the same order."""
 INK, PALE = "#24292f", "#c9cfd6"
-BETTER_COLOR, WORSE_COLOR, EQUAL_COLOR, DIAGONAL_COLOR = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
 DOTS_PER_INCH = 160
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -153,34 +151,6 @@ def draw_intervals(intervals: Sequence[Interval], *, title: str, x_label: str, z
     axis.grid(axis="x", color=PALE, lw=0.6, alpha=0.7)
     axis.tick_params(axis="y", length=0)
     axis.spines["left"].set_visible(False)
-    return figure
-
-
-def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, title: str, note: str) -> Figure:
-    """Matrix of all pairwise comparisons.
-
-    Args:
-        names: Names of rows and columns, n of them.
-        verdicts: Matrix [n, n]: 1 the row is better than the column, -1 worse, 0 equal; the diagonal is not read.
-        title: Title above the matrix.
-        note: Small print below the matrix, such as the level of the test.
-    """
-    size = 0.62 * len(names)
-    figure, axis = _axis(size + 3.4, size + 2.6, title)
-    # Signs beside the colors, for readers that cannot tell red from green.
-    for row, column in np.ndindex(*verdicts.shape):
-        verdict = int(verdicts[row, column])
-        color, sign = {1: (BETTER_COLOR, "+"), -1: (WORSE_COLOR, "−"), 0: (EQUAL_COLOR, "~")}[verdict]
-        if row == column:
-            color, sign = DIAGONAL_COLOR, ""
-        axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fc=color, ec="white", lw=2))
-        axis.text(column, row, sign, ha="center", va="center", fontsize=13, fontweight="bold", color=INK)
-    axis.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5), aspect="equal")
-    axis.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
-    axis.set_yticks(range(len(names)), names)
-    axis.tick_params(length=0)
-    axis.spines[:].set_visible(False)
-    figure.supxlabel(note, fontsize=9, color=INK)
     return figure
 
 

@@ -10,7 +10,6 @@ from rlftsim.experiments.paper import reward_ablation
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.tables import RMM, Row, TextTable, load_published
-from rlftsim.viewer.figure import draw_verdicts
 
 ALPHA = 1e-3
 SIGNS = {1: "+", -1: "−", 0: "~"}
@@ -18,7 +17,7 @@ SIGNS = {1: "+", -1: "−", 0: "~"}
 
 
 def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
-    """The matrix of verdicts, as a table and as a figure; the best reward first.
+    """The matrix of verdicts as a table, the best reward first.
 
     Args:
         measured: Rows of the reward ablation by name, in any order.
@@ -59,12 +58,6 @@ def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> Experiment
             "p_values": [[gain.p_value for gain in line] for line in gains],
             "differences": [[gain.difference for gain in line] for line in gains],
         },
-        figure=draw_verdicts(
-            names,
-            verdicts,
-            title="Row against column, per-scenario RMM",
-            note=f"+ better, − worse, ~ no difference at {ALPHA:g} ({count} scenarios)",
-        ),
     )
 
 
