@@ -28,10 +28,8 @@ from rlftsim.scenario.dataset import (
     read_manifest,
 )
 from rlftsim.scenario.shards import AGENT_COLUMNS, ShardReader, hash_file
-from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, Scenario
 
-MAX_SPEED_SCENARIOS = 200
-"""Scenarios, spread evenly over the index, that speeds are taken from at most."""
 FAR_MAP_M = 200.0
 """A map whose nearest point is farther from the ego is taken to be in another frame."""
 
@@ -74,15 +72,6 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class SpeedStats:
-    """Speeds of valid states of agents of a type, in meters per second."""
-
-    mean_mps: float
-    p95_mps: float
-    max_mps: float
-
-
-@dataclass(frozen=True)
 class DatasetStats:
     """Counts and means over a data set."""
 
@@ -98,8 +87,6 @@ class DatasetStats:
     percent_with_lights: float
     kilobytes_per_scenario: float
     """Size of all shards over the scenarios in them, in units of 1000 bytes."""
-    speeds: Mapping[str, SpeedStats]
-    """By type of agent, from `MAX_SPEED_SCENARIOS` scenarios at most."""
     by_source: Mapping[str, int]
     by_guessed: Mapping[str, int]
     """Scenarios in which a value is guessed, by the word for it."""
@@ -154,7 +141,6 @@ def dataset_stats(folder: str | os.PathLike[str], *, split: str | None = None) -
     index = dataset.index
     num_scenarios = max(len(dataset), 1)
     agents = {name.removeprefix("num_"): int(sum(index[name].to_pylist())) for name in AGENT_COLUMNS}
-    positions = np.unique(np.linspace(0, len(dataset) - 1, min(MAX_SPEED_SCENARIOS, len(dataset))).astype(int))
     # a shard holds scenarios of all splits, so the size is that of the whole data set
     total_bytes = sum((dataset.folder / entry.file).stat().st_size for entry in dataset.manifest.shards)
     total_rows = max(sum(entry.num_rows for entry in dataset.manifest.shards), 1)
@@ -167,7 +153,6 @@ def dataset_stats(folder: str | os.PathLike[str], *, split: str | None = None) -
         mean_map_points=sum(index["num_map_points"].to_pylist()) / num_scenarios,
         percent_with_lights=100.0 * sum(n > 0 for n in index["num_light_states"].to_pylist()) / num_scenarios,
         kilobytes_per_scenario=total_bytes / total_rows / 1000.0,
-        speeds=_compute_speeds(dataset, positions),
         by_guessed=_count([word for words in index["guessed"].to_pylist() for word in words.split()]),
     )
 
@@ -292,20 +277,3 @@ def _format_repeats(count: int) -> str:
 
 def _count(values: list) -> dict:
     return dict(sorted(Counter(values).items()))
-
-
-def _compute_speeds(dataset: ScenarioDataset, positions: np.ndarray) -> dict[str, SpeedStats]:
-    """Speeds by type of agent, over the scenarios at some positions of a data set."""
-    speeds, types = [np.zeros(0)], [np.zeros(0, np.int8)]
-    for position in positions:
-        scenario = dataset[int(position)]
-        tracks = scenario.tracks.select(scenario.simulated_indices)
-        speeds.append(np.linalg.norm(tracks.velocity.astype(np.float64), axis=-1)[tracks.valid])
-        types.append(np.repeat(tracks.object_type, tracks.valid.sum(1)))
-    speed, object_type = np.concatenate(speeds), np.concatenate(types)
-    groups = {member.name.lower(): speed[object_type == member] for member in ObjectType}
-    return {
-        name: SpeedStats(float(group.mean()), float(np.quantile(group, 0.95)), float(group.max()))
-        for name, group in groups.items()
-        if len(group)
-    }

@@ -33,7 +33,7 @@ def verify(data: str) -> int:
 
 
 def stats(data: str, *, split: str | None = None) -> None:
-    """Count scenarios, agents, lights and speeds.
+    """Count scenarios, agents, map points and lights.
 
     Args:
         data: Folder of a data set, or "synthetic" for the scenarios that ship with the package.
@@ -69,12 +69,12 @@ def pull(url: str, folder: Path) -> None:
 def _check_local(data: str) -> None:
     """Check that a data set is no address of a bucket."""
     if is_url(data):
-        raise ConfigError(f"{data}: this reads every shard: copy it with `rlftsim data pull` first.")
+        raise ConfigError(f"{data}: this needs every shard: copy it with `rlftsim data pull` first.")
 
 
 def _stats_rows(stats: DatasetStats) -> dict[str, str]:
     """Label -> value of a table of numbers."""
-    rows = {
+    return {
         "scenarios": f"{stats.num_scenarios} ({_counts(stats.by_split)})",
         "data sources": _counts(stats.by_source),
         "guessed in scenarios": _counts(stats.by_guessed) or "nothing",
@@ -85,10 +85,6 @@ def _stats_rows(stats: DatasetStats) -> dict[str, str]:
         "map points a scenario": f"{stats.mean_map_points:.0f}",
         "with traffic lights": f"{stats.percent_with_lights:.0f} %",
         "size": f"{stats.kilobytes_per_scenario:.1f} kB a scenario",
-    }
-    return rows | {
-        f"speed of {agent_type}s": f"mean {s.mean_mps:.1f}, 95 % below {s.p95_mps:.1f}, at most {s.max_mps:.1f} m/s"
-        for agent_type, s in stats.speeds.items()
     }
 
 
