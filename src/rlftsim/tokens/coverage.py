@@ -16,8 +16,6 @@ from rlftsim.tokens.motions import Motions, end_boxes, extract_motions, is_plaus
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
 TOKEN_S = STEPS_PER_TOKEN * STEP_S
-MAX_SPEED_BIN_MPS = 45
-"""Number of bins of 1 m/s; the last bin has all higher speeds."""
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e3, 4001)])
 """Edges of the bins that errors are counted in: a bin is 0.5 % wide."""
 
@@ -87,8 +85,6 @@ class ClassCoverage:
     """Error of the heading in rolling tokenization."""
     speed_mps: Spread = field(default_factory=Spread)
     """Mean speed of each motion."""
-    speed_counts: Int64[np.ndarray, "45"] = field(default_factory=lambda: np.zeros(MAX_SPEED_BIN_MPS, np.int64))
-    """Number of motions in each speed bin of 1 m/s."""
     num_glitches: int = 0
     """Number of motions left out as glitches of the log."""
 
@@ -188,8 +184,6 @@ def _add_motions(classes: tuple[ClassCoverage, ...], motions: Motions, vocabular
         coverage.single_m.add((table[nearest] - ends).norm(dim=-1).mean(-1))
         speed = np.hypot(class_motions[:, -1, 0], class_motions[:, -1, 1]) / TOKEN_S
         coverage.speed_mps.add(torch.from_numpy(speed))
-        slot = np.minimum(speed.astype(int), MAX_SPEED_BIN_MPS - 1)
-        coverage.speed_counts += np.bincount(slot, minlength=MAX_SPEED_BIN_MPS)
 
 
 def _add_tracks(classes: tuple[ClassCoverage, ...], scenario: Scenario, vocabulary: Vocabulary) -> None:

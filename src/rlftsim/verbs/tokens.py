@@ -50,7 +50,7 @@ def tokens(
 ) -> None:
     """Build a vocabulary of motion and map tokens from a data set, and measure how well it covers the data.
 
-    Writes FILE.safetensors and the folder FILE.report with a page, the numbers and a picture. With --check
+    Writes FILE.safetensors and the folder FILE.report with a page and a picture. With --check
     nothing is built: an existing vocabulary is compared with the data.
 
     Args:

@@ -1,10 +1,8 @@
-"""Report on a vocabulary: a folder with a page, numbers, and a picture.
+"""Report on a vocabulary: a folder with a page and a picture.
 
-For each class the picture shows the endpoints of the tokens, the size of the errors, and the speeds of tokens and
-motions.
+For each class the picture shows the endpoints of the tokens and the size of the errors.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +13,15 @@ from matplotlib.figure import Figure
 
 from rlftsim.errors import DataError
 from rlftsim.jobs.files import errors_name, new_folder, remove_folder, write_text
-from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
+from rlftsim.tokens.coverage import ClassCoverage, Spread
 from rlftsim.viewer.figure import COLORS, INK, save_figure
 
-PAGE, NUMBERS, PICTURE = "report.md", "report.json", "picture.png"
+PAGE, PICTURE = "report.md", "picture.png"
+FILES = (PAGE, PICTURE, "report.json")
+"""Files of a report; the last is in those of earlier versions alone."""
 
 USE_COLORS = LinearSegmentedColormap.from_list("use", ["#7cc4f0", "#1d63d8", "#0a1f4d"])
-DEAD, SPARE, BARS = "#e5735c", "#8b94a1", "#c3ccd8"
+DEAD, SPARE = "#e5735c", "#8b94a1"
 SINGLE, ROLLING = COLORS[:2]
 TICK_INCHES = 0.085
 SHOWN_FRACTION = 0.998
@@ -31,7 +31,7 @@ MANY_TOKENS = 3000
 
 
 def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> None:
-    """Write `report.md`, `report.json` and `picture.png` into a folder, all or none; an earlier report is replaced.
+    """Write `report.md` and `picture.png` into a folder, both or none; an earlier report is replaced.
 
     Args:
         folder: Folder of the report; only an earlier report may be in the folder.
@@ -42,48 +42,13 @@ def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *,
     Raises:
         DataError: The folder has files of no report, or cannot be written.
     """
-    if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= {PAGE, NUMBERS, PICTURE}):
+    if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= set(FILES)):
         raise DataError(f"{folder} is not a report on a vocabulary: name another place with --report.")
     # Written beside the folder and renamed, so that an interruption leaves the earlier report as it was.
     with errors_name(folder), new_folder(folder) as partial:
         write_text(partial / PAGE, report_page(classes, vocabulary=vocabulary, data=data))
-        write_text(partial / NUMBERS, json.dumps(report_numbers(classes, vocabulary=vocabulary, data=data), indent=1))
         coverage_picture(partial / PICTURE, classes, title=f"{vocabulary}, compared with {data}")
-        remove_folder(folder, (PAGE, NUMBERS, PICTURE))
-
-
-def report_numbers(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> dict[str, object]:
-    """All numbers of the page as plain JSON values in SI units.
-
-    Args:
-        classes: Coverage of each class of agents, the result of `measure_coverage`.
-        vocabulary: Description of the vocabulary, for titles.
-        data: Description of the data that the vocabulary is compared with.
-    """
-
-    def summarize(spread: Spread) -> dict[str, object]:
-        return {"count": spread.count, "mean": spread.mean, "p95": spread.p95, "max": spread.max}
-
-    numbers = {
-        coverage.class_name: {
-            "num_motions": coverage.single_m.count,
-            "num_glitches": coverage.num_glitches,
-            "num_tokens": coverage.num_tokens,
-            "disk_radius_m": coverage.radius_m,
-            "single_error_m": summarize(coverage.single_m),
-            "rolling_error_m": summarize(coverage.rolling_m),
-            "rolling_heading_error_rad": summarize(coverage.heading_rad),
-            "fastest_token_mps": float(coverage.token_speed_mps.max()),
-            "fastest_motion_mps": coverage.speed_mps.max,
-            "asymmetry_m": coverage.asymmetry_m,
-            "num_dead": int(coverage.is_dead.sum()),
-            "num_spare": int(coverage.is_spare.sum()),
-            "num_implausible": int(coverage.is_implausible.sum()),
-            "token_0_stands_still": coverage.stands_still,
-        }
-        for coverage in classes
-    }
-    return {"vocabulary": vocabulary, "data": data, "classes": numbers}
+        remove_folder(folder, FILES)
 
 
 ROWS = {
@@ -133,20 +98,19 @@ def _centimeters(spread: Spread) -> str:
 
 
 def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: str) -> None:
-    """Draw a row of three panels for each class, 17 inches wide.
+    """Draw a row of two panels for each class, 13 inches wide.
 
     Args:
         path: PNG to write; no half-written file is left.
         classes: Coverage of each class of agents, the result of `measure_coverage`.
         title: Description of vocabulary and data above all panels.
     """
-    figure = Figure(figsize=(17, 4.3 * len(classes) + 0.6), layout="constrained")
+    figure = Figure(figsize=(13, 4.3 * len(classes) + 0.6), layout="constrained")
     figure.suptitle(title, fontsize=13, fontweight="bold", x=0.01, ha="left", color=INK)
-    axes = figure.subplots(len(classes), 3, squeeze=False, gridspec_kw={"width_ratios": [2.3, 1, 1]})
+    axes = figure.subplots(len(classes), 2, squeeze=False, gridspec_kw={"width_ratios": [2.3, 1]})
     for row, coverage in zip(axes, classes):
         _draw_tokens(figure, row[0], coverage)
         _draw_errors(row[1], coverage)
-        _draw_speeds(row[2], coverage)
         for axis in row:
             axis.spines[["top", "right"]].set_visible(False)
             axis.tick_params(labelsize=9)
@@ -226,27 +190,3 @@ def _draw_errors(axis: Axes, coverage: ClassCoverage) -> None:
     axis.set_ylabel("fraction with at most this error [%]", fontsize=9)
     if axis.lines:
         axis.legend(loc="lower right", fontsize=8, framealpha=0.9, title="mean · 95 % · max", title_fontsize=8)
-
-
-def _draw_speeds(axis: Axes, coverage: ClassCoverage) -> None:
-    """Draw a histogram of the motions' speeds, with a mark below it for the speed of each token."""
-    counts, speeds = coverage.speed_counts, coverage.token_speed_mps
-    # The logarithmic axis begins at 0.1, so that below one motion there is room for the marks of the tokens.
-    top = max(int(counts.max()), 10) * 3
-    axis.bar(np.arange(len(counts)) + 0.5, np.maximum(counts, 0.1), width=0.94, color=BARS, label="motions")
-    groups = (
-        (coverage.is_dead, DEAD, "tokens without motions"),
-        (coverage.is_spare, SPARE, "tokens for speeds the data lack"),
-        (~coverage.is_unused, SINGLE, "used tokens"),
-    )
-    for is_member, color, label in groups:
-        if is_member.any():
-            axis.vlines(speeds[is_member], 0.12, 0.55, color=color, lw=0.7, label=label)
-    fastest = max(float(np.quantile(speeds, SHOWN_FRACTION)), coverage.speed_mps.max)
-    axis.set(yscale="log", ylim=(0.1, top), xlim=(-0.01 * fastest, min(fastest * 1.05 + 1, MAX_SPEED_BIN_MPS + 2)))
-    axis.set_title("speed", loc="left", fontsize=11, color=INK)
-    name = f"speed [m/s]   tokens up to {speeds.max():.1f}, motions up to {coverage.speed_mps.max:.1f}"
-    axis.set_xlabel(name, fontsize=9)
-    axis.set_ylabel("motions per m/s", fontsize=9)
-    axis.set_yticks([y for y in 10.0 ** np.arange(8) if y <= top])
-    axis.legend(loc="upper right", fontsize=8, framealpha=0.9)
