@@ -50,7 +50,7 @@ def test_an_agent_that_leaves_the_road_pays_for_it(scenario, states):
     (row,) = (k for k, name in enumerate(explanation.agent_names) if "ego" in name)
     off_road, edge = FEATURE_NAMES.index("offroad_indication"), FEATURE_NAMES.index("distance_to_road_edge")
     assert explanation.cost[off_road, :, WHOLE_FUTURE].argmax() == row
-    assert explanation.event_fraction[1, row, 40:44].all()
+    assert explanation.events[1, :, row, 40:44].all()
     assert explanation.cost[edge, row, :WHOLE_FUTURE].sum() > 0
 
 

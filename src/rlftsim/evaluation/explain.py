@@ -76,11 +76,6 @@ class Explanation:
     rollouts: SceneMotion
 
     @property
-    def event_fraction(self) -> Float[np.ndarray, "J E T"]:
-        """Fraction of rollouts with an event at a step."""
-        return self.events.mean(1)
-
-    @property
     def lost(self) -> float:
         """Ceiling minus score; the sum of `cost`."""
         return float(self.ceiling.meta_metric - self.result.meta_metric)

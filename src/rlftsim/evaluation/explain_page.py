@@ -23,9 +23,8 @@ from rlftsim.jobs.files import remove_folder, remove_temporaries, write_atomical
 from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.runner import Advance, Joining, Runner, Share, choose_runner
-from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
+from rlftsim.realism.config import FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
-from rlftsim.viewer.chart import Chart, Curve, chart_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html, read_asset, table_html, tile_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
@@ -196,7 +195,6 @@ def explanation_html(explanation: Explanation, policy: str = "") -> str:
         _agents_html(explanation),
         "<h2>Which steps</h2>",
         _strips_html(explanation),
-        _charts_html(explanation),
         "<h2>Histograms</h2>",
         '<p class="note">Evaluated agents together, official bins; values beyond the range lie in the outer bins. As '
         "in the official evaluator, steps without a value (the last one or two of speeds and accelerations) lie in a "
@@ -268,23 +266,6 @@ def _strips_html(explanation: Explanation) -> str:
         f"<span>+{num_steps * STEP_S:.0f} s</span></span><span></span>"
     )
     return f'<div class="card strip">{"".join(rows)}</div><p class="note">Red: costs; green: better than the log.</p>'
-
-
-def _charts_html(explanation: Explanation) -> str:
-    """Two charts over time: the four costliest histogram features, and frequencies of collisions and violations."""
-    steps = np.nan_to_num(explanation.cost[: len(HISTOGRAM_FEATURES), :, :WHOLE_FUTURE]).sum(1)  # [H, T]
-    seconds = ((np.arange(steps.shape[1]) + 1) * STEP_S).tolist()
-    costliest = np.argsort(-steps.sum(1), kind="stable")[:4]
-    # in thousandths: a single step costs little
-    costs = [Curve(_words(HISTOGRAM_FEATURES[i]), seconds, (1000 * steps[i]).tolist()) for i in costliest]
-    fraction = explanation.event_fraction.mean(1)  # [J, T]
-    events = [Curve(_words(name), seconds, fraction[row].tolist()) for row, name in enumerate(BERNOULLI_FEATURES)]
-    note = "Evaluated agents, where the log is valid. Their cost belongs to the whole future and is in the tables only."
-    charts = (
-        Chart("Cost of a step, all evaluated agents", "seconds after now", "thousandths for 0.1 s", costs),
-        Chart("Rollouts with an event", "seconds after now", "fraction", events, note=note),
-    )
-    return f'<div class="charts">{"".join(chart_html(chart) for chart in charts)}</div>'
 
 
 def _histogram_html(histogram: FeatureHistogram) -> str:
