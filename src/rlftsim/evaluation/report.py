@@ -24,7 +24,7 @@ from rlftsim.scenario.dataset import dataset_folder
 from rlftsim.statistics import MeanInterval
 from rlftsim.training.run_folder import describe_environment, flatten, read_metrics, stored_settings
 from rlftsim.viewer.chart import Chart, chart_html, label_ticks
-from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset, table_html, tile_html
+from rlftsim.viewer.page import Animation, animation_html, page_html, table_html, tile_html
 
 MAX_ROWS = 1000
 """Rows of the index: of more scenarios those that lose most."""
@@ -185,7 +185,7 @@ def report_html(report: Report) -> str:
     if report.footnotes:
         notes = "".join(f"<li>{escape(text)}</li>" for text in report.footnotes)
         sections.append(f'<h2>Notes</h2><ol class="footnotes">{notes}</ol>')
-    return page_html(report.title, "\n".join(s for s in sections if s), extra_js=read_asset("chart.js"))
+    return page_html(report.title, "\n".join(s for s in sections if s))
 
 
 def _sentence(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Line charts as inline SVG: axes, labels, a smoothed line over the raw one; a page needs no plotting library."""
+"""Line charts as inline SVG: axes, labels, lines; a page needs no plotting library."""
 
 import math
 from collections.abc import Sequence
@@ -7,16 +7,14 @@ from html import escape
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import savgol_filter
 
 from rlftsim.errors import DataError
-from rlftsim.viewer.page import embed_json
 
 WIDTH, HEIGHT = 460, 270
 LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
 """Room around the plotted area, in units of the SVG."""
-MAX_DRAWN_POINTS = 600
-MIN_POINTS_TO_SMOOTH = 12
+MAX_DRAWN_POINTS = 200
+MAX_DOTS = 11
 NUM_SERIES_COLORS = 4
 DRAWN_MAGNITUDE = 1e30
 """Values farther from zero count as not finite."""
@@ -91,29 +89,11 @@ def chart_html(chart: Chart) -> str:
         line = '<svg viewBox="0 0 24 16" aria-hidden="true"><path d="M2 8H22" stroke="{}" stroke-width="3"/></svg>'
         items = "".join(f"<li>{line.format(css_color(i))}{escape(c.name)}</li>" for i, c in enumerate(chart.curves))
         legend = f'<ul class="legend chart-legend">{items}</ul>'
-    # chart.js shows under the pointer: positions in the SVG, and the values as text.
-    hover = []
-    for index, (name, x, y) in enumerate(curves):
-        across, down = ([round(float(v), 1) for v in values] for values in (axes.horizontal(x), axes.vertical(y)))
-        at, value = [f"{v:g}" for v in np.round(x, 2)], [f"{v:.4g}" for v in y]
-        hover.append({"name": name, "color": css_color(index), "x": across, "y": down, "at": at, "value": value})
     return (
         f'<figure class="chart">{title}{legend}'
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(shapes)}</svg>'
-        f'<script type="application/json">{embed_json(hover)}</script>{note}</figure>'
+        f"{note}</figure>"
     )
-
-
-def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
-    """Value at each point of the straight line fitted to its neighbors.
-
-    In the interior that is a running mean; at the ends the line has neither the bias nor the jumps of a mean.
-
-    Args:
-        values: Values [n] at equal distances.
-        window: Odd number of fitted points around each point; near the ends, points of mostly one side.
-    """
-    return np.asarray(values if window == 1 else savgol_filter(values, window, polyorder=1), float)
 
 
 def css_color(index: int) -> str:
@@ -176,26 +156,10 @@ def _select_points(curve: Curve) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
 
 
-def _smoothed(y: np.ndarray) -> np.ndarray:
-    """Smoothed values, never beyond the raw values: a rate stays above zero."""
-    return np.clip(smooth(y, _window(len(y))), y.min(), y.max())
-
-
-def _window(num_points: int) -> int:
-    """Odd number of points to average over; 1 = too few to smooth."""
-    return 1 if num_points < MIN_POINTS_TO_SMOOTH else 2 * (num_points // 24) + 3
-
-
 def _compute_axes(curves: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes:
-    """Limits around the smoothed lines and all but the most extreme raw points."""
+    """Limits around all points and the reference."""
     x = np.concatenate([x for _, x, _ in curves])
-    heights = []
-    for _, _, y in curves:
-        if len(y):
-            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *_smoothed(y)]
-    if chart.reference:
-        heights.append(chart.reference[1])
-    y = np.array(heights)
+    y = np.concatenate([y for _, _, y in curves] + ([np.array([chart.reference[1]])] if chart.reference else []))
     # A constant curve gets a margin of its own, or the axis would have no extent.
     margin = 0.06 * (y.max() - y.min()) or max(0.05 * abs(float(y[0])), 1e-3)
     wide = float(x.max()) if x.max() > x.min() else float(x.min()) + 1
@@ -232,24 +196,8 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
 
 
 def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> str:
-    """Raw line, pale, and smoothed line; dots where points are too few to smooth."""
-    if not len(x):
-        return ""
-    window = _window(len(x))
-    across, down = axes.horizontal(x), axes.vertical(y)
-    raw = _path(across, down)
-    if window == 1:
-        dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{color}"/>' for a, b in zip(across, down))
-        return f'<path class="smooth" d="{raw}" stroke="{color}"/>{dots}'
-    smoothed = _path(across, axes.vertical(_smoothed(y)))
-    # A nested svg clips what lies outside its box: the most extreme raw points.
-    box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
-    frame = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
-    return (
-        f'<svg {frame} viewBox="{box}"><path class="raw" d="{raw}" stroke="{color}"/></svg>'
-        f'<path class="smooth" d="{smoothed}" stroke="{color}"/>'
-    )
-
-
-def _path(x: np.ndarray, y: np.ndarray) -> str:
-    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y))
+    """Line, with dots where points are few."""
+    points = [f"{a:.1f} {b:.1f}" for a, b in zip(axes.horizontal(x), axes.vertical(y))]
+    dots = "".join('<circle cx="{}" cy="{}" r="3" fill="{}"/>'.format(*point.split(), color) for point in points)
+    line = f'<path class="curve" d="M{"L".join(points)}" stroke="{color}"/>' if points else ""
+    return line + (dots if len(points) <= MAX_DOTS else "")

@@ -97,14 +97,13 @@ def animation_html(animation: Animation) -> str:
     )
 
 
-def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "") -> str:
+def page_html(title: str, body: str, *, extra_css: str = "") -> str:
     """A whole self-contained page.
 
     Args:
         title: Title of the page, plain text.
         body: HTML inside of `<main>`, with texts that are already escaped.
         extra_css: Style rules after those of the player.
-        extra_js: Script after the player's, in the same page.
     """
     # player and drawing module in one function: a page that stands alone cannot import
     drawing = read_asset("drawing.js").partition("\nexport {")[0]
@@ -113,7 +112,7 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>\n{read_asset('palette.css')}{read_asset('page.css')}{extra_css}</style>"
-        f"</head>\n<body><main>\n{body}\n</main>\n<script>\n{script}{extra_js}</script></body></html>\n"
+        f"</head>\n<body><main>\n{body}\n</main>\n<script>\n{script}</script></body></html>\n"
     )
 
 
