@@ -47,7 +47,7 @@ def test_parts_of_features_are_weight_times_change_of_likelihood(seed):
     for rollout in range(4):
         others = [other for other in range(4) if other != rollout]
         left = score_features(log, compute_features(log, select_rollouts(states, others))).likelihoods
-        torch.testing.assert_close(credit.by_feature[rollout].float(), weights * (whole - left), atol=1e-6, rtol=0)
+        torch.testing.assert_close(credit.added.sum(1)[rollout].float(), weights * (whole - left), atol=1e-6, rtol=0)
 
 
 @SLOW

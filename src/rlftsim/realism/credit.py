@@ -39,11 +39,6 @@ class Credit:
     """Number of identical rollouts behind each of the N, all with the same shares."""
 
     @property
-    def by_feature(self) -> Float64[Tensor, "N F"]:
-        """Weight times the feature's likelihood with all rollouts, minus that without the rollout."""
-        return self.added.sum(1)
-
-    @property
     def by_agent(self) -> Float64[Tensor, "N E"]:
         """Sum over features, for each agent."""
         return self.added.sum(-1)

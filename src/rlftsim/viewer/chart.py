@@ -43,7 +43,6 @@ class Chart:
     curves: Sequence[Curve]
     reference: tuple[str, float] | None = None
     """Name and height of a dashed horizontal line, such as the KL target."""
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,12 +68,11 @@ class Axes:
 
 
 def chart_html(chart: Chart) -> str:
-    """A `<figure>` with title, legend (for more than one curve), SVG and note."""
+    """A `<figure>` with title, legend (for more than one curve) and SVG."""
     curves = [(curve.name, *_select_points(curve)) for curve in chart.curves]  # name, x [n], y [n]
     title = f'<figcaption class="chart-title">{escape(chart.title)}</figcaption>'
-    note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
     if not any(len(x) for _, x, _ in curves):
-        return f'<figure class="chart">{title}<p class="note">No data.</p>{note}</figure>'
+        return f'<figure class="chart">{title}<p class="note">No data.</p></figure>'
     axes = _compute_axes(curves, chart)
     shapes = [_frame_svg(axes, chart)]
     shapes += [_curve_svg(axes, x, y, css_color(index)) for index, (_, x, y) in enumerate(curves)]
@@ -92,7 +90,7 @@ def chart_html(chart: Chart) -> str:
     return (
         f'<figure class="chart">{title}{legend}'
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(shapes)}</svg>'
-        f"{note}</figure>"
+        "</figure>"
     )
 
 
