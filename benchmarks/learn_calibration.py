@@ -13,7 +13,7 @@ from statistics import fmean
 import torch
 
 from rlftsim.jobs.progress import progress_bar
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
@@ -47,8 +47,8 @@ def main() -> None:
     )
     fabric = start_fabric(DeviceConfig(accelerator="cpu", processes=1))
     trained, calibrated = (load_policy(arguments.model) for _ in range(2))
-    assert isinstance(trained, CalibratedPolicy)
-    assert isinstance(calibrated, CalibratedPolicy)
+    assert isinstance(trained, CalibratedTokenPolicy)
+    assert isinstance(calibrated, CalibratedTokenPolicy)
     learner = prepare(trained.base, config, fabric.device)
     learner.reference = calibrated.requires_grad_(False)
     order = torch.Generator().manual_seed(0)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.jobs.progress import progress_bar
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import score_rollouts
 from rlftsim.rewards import compute_rewards, leave_one_out, parse_reward
@@ -59,7 +59,7 @@ def main() -> None:
         compare(arguments.out, arguments.compare, arguments.seeds, arguments.model)
         return
     scenarios = open_dataset(arguments.data, "training")
-    policy = CalibratedPolicy(load_policy(arguments.model), FEATURES).eval().requires_grad_(False)
+    policy = CalibratedTokenPolicy(load_policy(arguments.model), FEATURES).eval().requires_grad_(False)
     names: dict[str, list[str]] = {}
     for seed in range(arguments.seeds):
         credits, scores, fisher = collect(policy, scenarios, seed)
@@ -75,7 +75,7 @@ def main() -> None:
                     step *= math.sqrt(KL / kl)
                 label = f"{name}_free" if free else name
                 folder = arguments.out / f"{label}-{seed}"
-                CalibratedPolicy(policy.base, FEATURES, step.tolist()).save_pretrained(folder, card=f"# {label}\n")
+                CalibratedTokenPolicy(policy.base, FEATURES, step.tolist()).save_pretrained(folder, card=f"# {label}\n")
                 names.setdefault(label, []).append(str(folder))
                 print(f"{label}, seed {seed}: KL {kl:.4f} before the last scaling", flush=True)
     models = " ".join(f"{label}={','.join(folders)}" for label, folders in names.items())
@@ -110,7 +110,7 @@ def format_interval(values: np.ndarray, clusters: np.ndarray) -> str:
 
 
 def collect(
-    policy: CalibratedPolicy, scenarios: object, seed: int
+    policy: CalibratedTokenPolicy, scenarios: object, seed: int
 ) -> tuple[dict[str, list[Tensor]], list[Tensor], np.ndarray]:
     """Credits [B, N, A] of rewards and constraints, score functions [B, N, A, K], both by batch, and the Fisher matrix.
 
@@ -162,9 +162,9 @@ def mean_gradient(credits: list[Tensor], scores: list[Tensor]) -> np.ndarray:
     return torch.stack(gradients).mean(0).numpy()
 
 
-def measure_kl(policy: CalibratedPolicy, scenarios: object, step: np.ndarray, seed: int) -> float:
+def measure_kl(policy: CalibratedTokenPolicy, scenarios: object, step: np.ndarray, seed: int) -> float:
     """Mean KL of the calibrated policy to its base along own rollouts, nats per decision."""
-    calibrated = CalibratedPolicy(policy.base, FEATURES, step.tolist()).eval()
+    calibrated = CalibratedTokenPolicy(policy.base, FEATURES, step.tolist()).eval()
     total, num_decisions = 0.0, 0
     for index in range(0, len(scenarios), max(len(scenarios) // NUM_MEASURED, 1)):
         batch: ScenarioBatch = batch_with_futures(scenarios, [index])

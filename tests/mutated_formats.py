@@ -37,7 +37,7 @@ from rlftsim.evaluation.reward_variance import measure_variances
 from rlftsim.experiments.exam import Ledger
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
 from rlftsim.goals.types import StoredGoals, write_goal_file
-from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CHANGES, CalibratedTokenPolicy
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk, write_catk_vocabulary
 from rlftsim.policies.smart.config import smart_nano
@@ -246,7 +246,7 @@ def make_trafficbots(folder: Path) -> None:
 
 
 def make_calibrated(folder: Path) -> None:
-    policy = CalibratedPolicy(tiny.tiny_policy(_vocabulary()), ("speed_slow", "speed_fast"), [0.1, -0.2])
+    policy = CalibratedTokenPolicy(tiny.tiny_policy(_vocabulary()), ("speed_slow", "speed_fast"), [0.1, -0.2])
     scores = {name: 0.01 for name in ("rmm", "kinematic", "interactive", "map_based")}
     changes = {name: {"change": 0.01, "t": 2.0} for name in CHANGES}
     calibration = {

@@ -544,7 +544,7 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     assert (tmp_path / "calibrated" / "model" / "calibration.png").read_bytes().startswith(b"\x89PNG")
     status, out, _ = run(capsys, "model", "show", tmp_path / "calibrated")
     assert status == 0
-    assert "CalibratedPolicy" in out
+    assert "CalibratedTokenPolicy" in out
     assert "| speed_gap_under_2s |" in out
     for run_folder in (base, tuned, tmp_path / "catk", tmp_path / "gcsl", tmp_path / "calibrated"):
         assert (run_folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")

@@ -9,7 +9,7 @@ import scenes
 import tiny
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.calibrated.features import FEATURES
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.compact import CompactPolicy
 from rlftsim.policies.smart.config import CompactConfig
@@ -39,7 +39,7 @@ def test_a_compact_policy_keeps_the_contract(vocabulary):
 
 def test_a_calibrated_compact_policy_keeps_the_contract(vocabulary):
     names = tuple(FEATURES.names())
-    report = check_policy(CalibratedPolicy(compact(vocabulary), names, [0.2] * len(names)), SCENES[:2])
+    report = check_policy(CalibratedTokenPolicy(compact(vocabulary), names, [0.2] * len(names)), SCENES[:2])
     assert report.is_passed, str(report)
 
 

@@ -8,7 +8,7 @@ import torch
 
 import scenes
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.distributions import LazyTokenDistribution, TokenDistribution
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.config import SmartConfig
@@ -114,7 +114,7 @@ def test_a_draw_that_ties_with_an_excluded_token_keeps_its_probability():
 def test_models_made_of_a_model_sample_as_it_does(truncated):
     assert truncated.with_goal_conditioning("concat").sampling == TOP
     assert truncated.with_settings(truncated.config, None, ()).sampling == TOP
-    calibrated = CalibratedPolicy(truncated, ("edge_0.5s",), eta=[0.5]).eval()
+    calibrated = CalibratedTokenPolicy(truncated, ("edge_0.5s",), eta=[0.5]).eval()
     assert calibrated.sampling == TOP
     rollouts = roll(calibrated)
     scored = calibrated.score(calibrated.encode(collate([scenes.bend()])), rollouts)

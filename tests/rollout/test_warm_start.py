@@ -8,7 +8,7 @@ import pytest
 import scenes
 import tiny
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.warm_start import start_from_rollouts
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS
@@ -70,7 +70,7 @@ def test_a_run_trains_on_such_starts_and_short_logs_and_odd_seconds_are_refused(
     policy = tiny.tiny_policy(tiny.small_vocabulary([world]), tiny.WITHOUT_CHANCE)
     updates = []
     model = train_policy(
-        CalibratedPolicy(policy, config.features).eval(),
+        CalibratedTokenPolicy(policy, config.features).eval(),
         world,
         tmp_path / "run",
         config,

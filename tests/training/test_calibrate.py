@@ -1,6 +1,7 @@
 """Calibration: gradients without a backward pass, a step that leaves means as they are, and runs that resume."""
 
 import copy
+import dataclasses
 import itertools
 import json
 
@@ -9,13 +10,16 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+import scenes
 import tiny
 from rlftsim.errors import ConfigError
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
+from rlftsim.policies.registry import load_policy
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import ObjectType
 from rlftsim.training.calibrate import (
     CalibrationLearner,
     best_length,
@@ -36,7 +40,7 @@ CONFIG = CalibrateConfig(
 @pytest.fixture
 def policy(vocabulary):
     base = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE)
-    return CalibratedPolicy(base, CONFIG.features).eval()
+    return CalibratedTokenPolicy(base, CONFIG.features).eval()
 
 
 # ---- gradients -----------------------------------------------------------------------------------------------------
@@ -157,6 +161,18 @@ def test_a_calibration_says_what_each_feature_weighs_and_earns(policy, drawn_sce
     assert "(+0.0)" not in card
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_measure_that_no_scenario_has_is_left_out_of_the_table(policy, tmp_path):
+    def walking(scenario):
+        types = np.full_like(scenario.tracks.object_type, ObjectType.PEDESTRIAN)
+        return dataclasses.replace(scenario, tracks=dataclasses.replace(scenario.tracks, object_type=types))
+
+    walkers = [walking(scenes.straight_road(name)) for name in ("a", "b", "c")]
+    model = train_policy(policy, walkers, tmp_path, CONFIG)
+    assert load_policy(model).calibration["held_back"][0]["rmm"]["change"] is None
+    assert "| – |" in (model / "README.md").read_text()
+
+
 def test_a_constraint_with_a_score_is_measured_by_it(policy, drawn_scenarios, tmp_path):
     @register_constraint("ade", tolerance=0.1, score="average_displacement_error")
     def ade(batch, rollouts, agents):
@@ -187,7 +203,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights(policy, vocabulary, d
         return original(learner, fabric)
 
     def fresh():
-        return CalibratedPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
+        return CalibratedTokenPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
 
     monkeypatch.setattr(CalibrationLearner, "measure", interrupted)
     with pytest.raises(KeyboardInterrupt, match="behind update 2"):
@@ -207,7 +223,7 @@ def measured_in(run):
 def test_processes_change_no_gradient(vocabulary, drawn_scenarios, tmp_path):
     measured = []
     for processes in (1, 2):
-        learner = CalibratedPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
+        learner = CalibratedTokenPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
         device = tiny.replace(tiny.CPU, processes=processes)
         out = tmp_path / str(processes)
         train_policy(learner, drawn_scenarios, out, tiny.replace(CONFIG, device=device))
@@ -231,7 +247,7 @@ def test_max_kl_bounds_the_distance_of_a_further_calibration_to_the_model_that_i
 
 
 def test_the_policy_must_have_the_features_of_the_settings(policy, drawn_scenarios, tmp_path):
-    with pytest.raises(ConfigError, match="make it with CalibratedPolicy"):
+    with pytest.raises(ConfigError, match="make it with add_features"):
         train_policy(policy, drawn_scenarios, tmp_path, tiny.replace(CONFIG, features=("speed_slow",)))
 
 

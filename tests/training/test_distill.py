@@ -8,7 +8,7 @@ import scenes
 import tiny
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.compact import CompactPolicy
 from rlftsim.policies.smart.config import CompactConfig
@@ -121,7 +121,7 @@ def test_a_student_is_calibrated_simulated_driven_and_exported_like_any_other(te
     student.save_pretrained(tmp_path / "student")
     calibrate = CalibrateConfig(num_scenarios=2, num_rollouts=2, lengths=(1.0,), micro_batch_size=1, device=tiny.CPU)
     calibrated = rs.finetune(str(tmp_path / "student"), [data[0], data[7]], tmp_path / "tuned", calibrate)
-    assert isinstance(calibrated, CalibratedPolicy)
+    assert isinstance(calibrated, CalibratedTokenPolicy)
     assert rs.simulate(calibrated, data[7], num_rollouts=2, seed=0).position.isfinite().all()
     common = ["--data", "synthetic", "--limit", "1"]
     assert main(["drive", "idm", "--model", str(tmp_path / "tuned"), *common, "--out", str(tmp_path / "drives")]) == 0

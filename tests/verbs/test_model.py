@@ -2,7 +2,7 @@
 
 import tiny
 from rlftsim.cli.main import main
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.training.config import FEATURES
 
@@ -20,7 +20,7 @@ def test_each_listed_model_can_be_used_by_its_name(capsys):
 def test_the_refusal_to_export_a_calibrated_model_names_the_smart_model_below_it_if_that_can_be(tmp_path, capsys):
     run, out = tmp_path / "run", str(tmp_path / "x.safetensors")
     base = tiny.tiny_policy(tiny.small_vocabulary(tiny.pack_scenarios(2)))
-    CalibratedPolicy(base, FEATURES).save_pretrained(run / "model")
+    CalibratedTokenPolicy(base, FEATURES).save_pretrained(run / "model")
     assert main(["model", "export", str(run), out]) == 2
     assert f"export {run / 'model' / 'base'}, which" in capsys.readouterr().err
     assert main(["model", "export", str(run / "model" / "base"), out]) == 0

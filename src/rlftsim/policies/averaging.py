@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError
-from rlftsim.policies.calibrated.policy import CalibratedPolicy, average_calibrations
+from rlftsim.policies.calibrated.policy import CalibratedPolicy, add_features, average_calibrations
 from rlftsim.rollout.fingerprint import fingerprint_policy
 
 
@@ -43,7 +43,7 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
         raise ConfigError(f"scale={scale:g} needs the base that the policies were fine-tuned from.")
     first = policies[0]
     if isinstance(first, CalibratedPolicy) and base is not None and not isinstance(base, CalibratedPolicy):
-        base = CalibratedPolicy(base, first.features).to(first.eta.device)  # with weights of 0
+        base = add_features(base, first.features).to(first.eta.device)  # with weights of 0
     for number, policy in enumerate(policies, 1):
         _check_same_settings(first, policy, f"policy {number} of {len(policies)}")
     if base is not None:

@@ -328,6 +328,8 @@ class GaussianDistribution:
     mean: Float[Tensor, "*batch D"]
     std: Float[Tensor, "*batch D"]
     mask: Bool[Tensor, "*batch"]
+    aim: Float[Tensor, "*batch D"] | None = None
+    """Mean without what goes on of earlier noise, for calibration; None = the mean."""
 
     @torch.no_grad()
     def sample(self, sampling: Sampling, noise: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:

@@ -58,7 +58,7 @@ class Recipe:
     gcsl: GcslConfig | None = field(default_factory=GcslConfig)
     """None likewise."""
     calibrate: CalibrateConfig | None = None
-    """None for policies without tokens, whose logits features are added to."""
+    """None for policies that decide neither by tokens nor by actions, which features could tilt."""
 
     @property
     def counterpart(self) -> str | None:

@@ -12,7 +12,7 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.config import CatkConfig, FinetuneConfig, GcslConfig, KlConfig, PretrainConfig
+from rlftsim.training.config import CalibrateConfig, CatkConfig, FinetuneConfig, GcslConfig, KlConfig, PretrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +23,7 @@ class TrafficBotsRecipe(Recipe):
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
     gcsl: GcslConfig | None = None
+    calibrate: CalibrateConfig | None = field(default_factory=CalibrateConfig)
 
     @property
     def counterpart(self) -> str:
@@ -75,6 +76,7 @@ def trafficbots_v15_rlftsim() -> TrafficBotsRecipe:
 def trafficbots_demo_rlftsim() -> TrafficBotsRecipe:
     """A small model for two CPU cores and a few hundred scenarios: many small updates, large steps."""
     return TrafficBotsRecipe(
+        method="calibrate",
         model=trafficbots_demo(),
         pretrain=PretrainConfig(
             epochs=10.0, batch_size=2, micro_batch_size=2, learning_rate=1e-3, warmup_updates=40, final_lr_ratio=0.0,

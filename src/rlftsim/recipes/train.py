@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from rlftsim.errors import ConfigError
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import add_features
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.card import model_card
 from rlftsim.rollout.policy import ConditionablePolicy
@@ -142,13 +142,11 @@ def prepare_policy(policy: Any, config: object) -> Any:
         config: Settings of the method.
 
     Raises:
-        ConfigError: The policy has no vocabulary or no weights, or a feature is unknown.
+        ConfigError: The policy has no weights, decides neither by tokens nor by actions, or a feature is unknown.
     """
     if not isinstance(config, CalibrateConfig):
         return policy
-    if isinstance(policy, CalibratedPolicy) and policy.features == config.features:
-        return policy
-    return CalibratedPolicy(policy, config.features)
+    return add_features(policy, config.features)
 
 
 def start_from_shorter_run(out: Path, epochs: float) -> None:

@@ -13,8 +13,9 @@ down is optional and opens a further door:
 | `RelitPolicy` | simulated for longer than 8 s without encoding maps anew whenever lights change |
 | `PretrainablePolicy` | pre-trained on logged tracks, token by token |
 | `ImitatedPolicy` | pre-trained on logged tracks with a special loss |
-| `CalibratablePolicy` | calibrated: a few named features of states and tokens get weights |
-| `TokenPolicy` | fine-tuned in closed loop on tokens (CAT-K, goal relabelling) |
+| `CalibratablePolicy` | calibrated: a few named features of states and decisions get weights |
+| `TokenPolicy` | fine-tuned in closed loop on tokens (CAT-K, goal relabelling), made calibratable |
+| `ActionPolicy` | made calibratable, with continuous actions |
 | `GoalConditionedPolicy` | given goals, and trained on goals |
 | `ConditionablePolicy` | made goal-conditioned, where a run with goals starts from a goal-free model |
 
@@ -420,11 +421,30 @@ class TokenPolicy(Policy, Protocol):
 
 
 @runtime_checkable
-class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
-    """A policy with a weighted sum of named features on the token logits; made of any policy by `policies.calibrated`.
+class ActionPolicy(Policy, Protocol):
+    """A policy whose decisions are continuous actions; the distributions are `distributions.GaussianDistribution`s."""
 
-    The distributions also have `base`, the distribution without the features, and `score_function(decision)`, the
-    gradient [..., K] of the log-probability by the K weights.
+    def predict_pose(
+        self, class_id: Int64[Tensor, "*#g"], speed: Float[Tensor, "*#g"], action: Float[Tensor, "*g D"], seconds: float
+    ) -> Float[Tensor, "*g 3"]:
+        """Where an action leads that is kept up: x, y and heading in the agent's frame, meters and radians.
+
+        Args:
+            class_id: 0 vehicle, 1 pedestrian, 2 cyclist; as the speed of a shape that broadcasts, such as [R, 1].
+            speed: Speeds of the agents, m/s, negative backwards.
+            action: Actions, as the distributions draw these, such as [R, actions, D].
+            seconds: Time from now.
+        """
+        ...
+
+
+@runtime_checkable
+class CalibratablePolicy(SavedPolicy, Policy, Protocol):
+    """A policy with a weighted sum of named features on the log-probabilities; made of a policy of tokens or actions by
+    `policies.calibrated.policy.add_features`.
+
+    The distributions also have `with_eta(eta)`, the distribution with other weights, and `score_function(decision)`,
+    the gradient [..., K] of the log-probability by the K weights.
     """
 
     eta: nn.Parameter

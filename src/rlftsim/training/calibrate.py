@@ -1,4 +1,4 @@
-"""Calibration: weights of a few named features on the token logits, fitted to a realism reward in a single step.
+"""Calibration: weights of a few named features of a decision, fitted to a realism reward in a single step.
 
     eta = length * natural direction(gradient of the reward, Fisher matrix, gradients of constrained means)
 
@@ -14,7 +14,7 @@ the signal of all weights of a network is not after tens of thousands. K feature
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -41,11 +41,14 @@ from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
 RIDGE = 1e-3
 """Part of the Fisher matrix's diagonal that is added to it, so that features that go together share a weight."""
 
+STEPS_PER_KL = 5
+"""Steps of 0.1 s that a KL of the settings is about: the duration of a token, whatever that of a decision."""
+
 Vector = Float64[np.ndarray, "K"]
 
 
 class CalibrateMethod(Method[CalibrateConfig]):
-    """Fit the weights of a `CalibratablePolicy`'s features, such as `policies.calibrated.policy.CalibratedPolicy`."""
+    """Fit the weights of a `CalibratablePolicy`'s features, see `policies.calibrated.policy.add_features`."""
 
     settings = CalibrateConfig
     title = "calibrate"
@@ -59,12 +62,12 @@ class CalibrateMethod(Method[CalibrateConfig]):
         self, policy: Any, scenarios: Scenarios, settings: CalibrateConfig, fabric: Fabric
     ) -> "CalibrationLearner":
         """Learner of the features' weights; the features have to be those of the settings."""
-        check_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), is_rewarded=True)
+        check_trainable(policy, scenarios, "calibration", needs=("features", "eta"), is_rewarded=True)
         check_constraints(settings.constraints)
         if tuple(policy.features) != settings.features:
             raise ConfigError(
                 f"the policy has the features {', '.join(policy.features)}, the settings others: make it with "
-                "CalibratedPolicy(base, config.features)."
+                "add_features(base, config.features)."
             )
         policy.to(fabric.device).eval().requires_grad_(False)
         optimizer = torch.optim.SGD([policy.eta])
@@ -192,16 +195,20 @@ class CalibrationLearner(Learner):
     @cached_property
     def direction(self) -> Float64[np.ndarray, "K"]:
         """The step of length 1; to be asked for once all gradients are there."""
-        mean, decisions = self.statistics.gradients.numpy().mean(0), float(self.statistics.counts[0])
+        mean, num_tokens = (
+            self.statistics.gradients.numpy().mean(0),
+            self._count_tokens(float(self.statistics.counts[0])),
+        )
         fixed = mean[1 + len(SUB_SCORES) :]
-        return natural_direction(mean[0], self.statistics.fisher.numpy() / max(decisions, 1.0), fixed, self.config.kl)
+        return natural_direction(mean[0], self.statistics.fisher.numpy() / max(num_tokens, 1.0), fixed, self.config.kl)
 
     def fit(self) -> tuple[Float64[np.ndarray, "K"], dict[str, Any]]:
         """The weights, and a record of the fit: values that JSON has."""
         scores = {name: self.statistics.scores[..., index].numpy() for index, name in enumerate(self.names)}
-        kls = scores["kl"].sum(1) / scores["num_decisions"].sum(1).clip(1)  # [1 + X]
+        kls = scores["kl"].sum(1) / self._count_tokens(scores["num_decisions"].sum(1)).clip(1)  # [1 + X]
         gains = scores["rmm"][1:] - scores["rmm"][0]  # [X, S]
-        length = best_length(self.config.lengths, gains.T[np.isfinite(gains).all(0)])
+        scored = gains.T[np.isfinite(gains).all(0)]
+        length = best_length(self.config.lengths, scored) if len(scored) else 0.0
         # KL grows with the square of the length: cut where the measured ones say so
         per_length = max(kl / tried**2 for kl, tried in zip(kls[1:], self.config.lengths))
         length = min(length, math.sqrt(self.config.max_kl / per_length)) if per_length > 0 else length
@@ -218,17 +225,21 @@ class CalibrationLearner(Learner):
             changes.append({"length": tried, "kl": float(kl)})
             for name in self.names[:-2]:
                 change = scores[name][row] - scores[name][0]
-                changes[-1][name] = {"change": float(np.nanmean(change)), "t": t_value(change[np.isfinite(change)])}
+                changes[-1][name] = {"change": finite_mean(change), "t": t_value(change[np.isfinite(change)])}
         return eta, {
             "reward": self.config.reward,
             "constraints": list(self.config.constraints),
             "num_scenarios": [len(self.fitted_ids), len(self.held_back_ids)],
             "num_rollouts": self.config.num_rollouts,
             "length": length,
-            "base": {name: float(np.nanmean(scores[name][0])) for name in self.names[:-2]},
+            "base": {name: finite_mean(scores[name][0]) for name in self.names[:-2]},
             "features": table,
             "held_back": changes,
         }
+
+    def _count_tokens(self, num_decisions: Any) -> Any:
+        """Number of tokens that last as long as some decisions."""
+        return num_decisions * (self.policy.steps_per_decision / STEPS_PER_KL)
 
     # ---- what is measured -------------------------------------------------------------------------------------------
 
@@ -293,7 +304,7 @@ class CalibrationLearner(Learner):
         rows = all_reduce_sum(rows, fabric).cpu()
         self.statistics.scores[stage, positions] = rows
         means = dict(zip(self.names, rows.nanmean(0).tolist()))
-        kl = means.pop("kl") / max(means.pop("num_decisions"), 1.0)
+        kl = means.pop("kl") / max(self._count_tokens(means.pop("num_decisions")), 1.0)
         return {"length": length, **means, "kl": kl}
 
     def _roll_out(
@@ -327,7 +338,7 @@ class Recorder:
         self.start = start
 
     def __call__(self, distribution: Any, state: object, sampling: Any, noise: Tensor) -> Tensor:
-        """Decisions [B, N, A], drawn as without a recorder.
+        """Decisions [B, N, A, *event], drawn as without a recorder.
 
         Args:
             distribution: Distribution of a calibrated policy.
@@ -339,7 +350,7 @@ class Recorder:
         if self.start is None:
             self.score = self.score + distribution.score_function(decision)
         else:
-            self.kl = self.kl + distribution.kl(replace(distribution, eta=self.start)).flatten(1).sum(1)
+            self.kl = self.kl + distribution.kl(distribution.with_eta(self.start)).flatten(1).sum(1)
         return decision
 
 
@@ -390,6 +401,12 @@ def best_length(lengths: Sequence[float], gains: Float64[np.ndarray, "S X"]) -> 
     if bend < 0:
         return float(np.clip(-slope / (2 * bend), 0.0, tried.max()))
     return float(tried.max()) if slope * tried.max() + bend * tried.max() ** 2 > 0 else 0.0
+
+
+def finite_mean(values: Float64[np.ndarray, "S"]) -> float | None:
+    """Mean of the finite values; None without any, such as of a score that no scenario held back has."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None
 
 
 def t_value(values: Float64[np.ndarray, "S"]) -> float | None:

@@ -614,7 +614,7 @@ class DistillConfig:
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """Calibration of a model with a vocabulary: a few named features on the token logits."""
+    """Calibration of a model: a few named features of its decisions, tokens or actions."""
 
     features: tuple[str, ...] = FEATURES
     """Names of the features; `rlftsim.features` is their entry-point group."""
@@ -625,12 +625,12 @@ class CalibrateConfig:
     constraints: tuple[str, ...] = CONSTRAINED_MEANS
     """Means that the step leaves as they are, by prediction: speed, evaluated_speed, min_ade, kinematic (realism)."""
     kl: float = 0.01
-    """Predicted KL of a step of length 1, nats per decision."""
+    """Predicted KL of a step of length 1, nats per half second, the duration of a token."""
     lengths: tuple[float, ...] = (0.7, 1.4)
     """Lengths that are tried on the scenarios held back; the best one on a parabola through their gains is taken."""
     max_kl: float = 0.005
-    """Largest measured KL of the result to the model that the run starts from, nats per decision; a longer step is cut.
-    What the constraints do not see grows with its square, the gain hardly."""
+    """Largest measured KL of the result to the model that the run starts from, nats per half second; a longer step is
+    cut. What the constraints do not see grows with its square, the gain hardly."""
     held_back: float = 0.2
     """Fraction of the scenarios that chooses the length, and not the direction."""
     num_scenarios: int = 256

@@ -152,7 +152,7 @@ def finetune(
             among the top K, fields catk.*. road: supervised fine-tuning on the model's own rollouts, guided by the log,
             fields road.*. gcsl: train the goal-conditioned weights on the model's own rollouts, relabelled with their
             endpoints, as a start for rlft with goals (--model OUT), fields gcsl.*. calibrate: fit the weights of a few
-            named features on the token logits, no weight of the model, to a realism reward without a change of speed,
+            named features of a decision, no weight of the model, to a realism reward without a change of speed,
             fields calibrate.*. Another NAME: the method that another package has registered, fields NAME.*.
         goal: Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
             --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
@@ -249,6 +249,6 @@ def _find_settings(recipe: Recipe, name: object, method: str) -> Any:
     if settings is None:
         raise ConfigError(
             f"recipe {name} has no section {method}: for a model with a vocabulary name another recipe, any "
-            "other model is trained by --method rlft."
+            "other model is trained by --method rlft, or by calibrate."
         )
     return settings

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import score_rollouts
 from rlftsim.rollout.simulate import simulate
@@ -28,5 +28,5 @@ def try_feature(name: str) -> None:
     Args:
         name: Name of a registered feature.
     """
-    policy: Any = CalibratedPolicy(load_policy("demo-base", "cpu"), [name], eta=[1.0])
+    policy: Any = CalibratedTokenPolicy(load_policy("demo-base", "cpu"), [name], eta=[1.0])
     simulate(policy, collate(find_small_scenarios()), num_rollouts=1, seed=0, num_steps=10)

@@ -13,7 +13,7 @@ import tiny
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.calibrated.features import FEATURES, TiltedDistribution, features_by_name, register_feature
-from rlftsim.policies.calibrated.policy import CHANGES, CalibratedPolicy
+from rlftsim.policies.calibrated.policy import CHANGES, CalibratedTokenPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
@@ -37,7 +37,7 @@ def base():
 
 @pytest.fixture
 def calibrated(base):
-    return CalibratedPolicy(base, NAMES, ETA)
+    return CalibratedTokenPolicy(base, NAMES, ETA)
 
 
 def distribution_of(policy, scenario, num_rollouts=2):
@@ -52,7 +52,7 @@ def distribution_of(policy, scenario, num_rollouts=2):
 def test_a_calibrated_policy_keeps_the_contract(base):
     config = {"max_map_neighbors": None, "map_radius_m": 12.0}
     with_all_neighbors = tiny.tiny_policy(base.vocabulary, tiny.replace(tiny.WITHOUT_CHANCE, **config)).train()
-    report = check_policy(CalibratedPolicy(with_all_neighbors, NAMES, ETA), SCENES[:2])
+    report = check_policy(CalibratedTokenPolicy(with_all_neighbors, NAMES, ETA), SCENES[:2])
     assert report.is_passed, str(report)
 
 
@@ -64,11 +64,12 @@ def test_every_python_sees_the_members_of_a_policy(calibrated):
 
 def test_with_eta_zero_it_decides_as_its_base_bit_for_bit(base):
     batch = collate(list(SCENES))
-    plain, off = (simulate(one, batch, num_rollouts=3, seed=1) for one in (base, CalibratedPolicy(base, NAMES)))
+    plain, off = (simulate(one, batch, num_rollouts=3, seed=1) for one in (base, CalibratedTokenPolicy(base, NAMES)))
     assert torch.equal(plain.position, off.position)
     assert torch.equal(plain.log_prob, off.log_prob)
     scored = [
-        one.score(one.encode(batch), plain).log_prob(plain.decision) for one in (base, CalibratedPolicy(base, NAMES))
+        one.score(one.encode(batch), plain).log_prob(plain.decision)
+        for one in (base, CalibratedTokenPolicy(base, NAMES))
     ]
     assert torch.equal(*scored)
 
@@ -92,7 +93,7 @@ def test_the_score_function_is_the_gradient_of_the_log_probability_by_eta(calibr
 
 
 def test_values_of_features_stay_within_their_bounds(base):
-    dist = distribution_of(CalibratedPolicy(base, NAMES), scenes.crowd(num_agents=40))
+    dist = distribution_of(CalibratedTokenPolicy(base, NAMES), scenes.crowd(num_agents=40))
     for feature in features_by_name(NAMES):
         values = feature(dist._candidates)
         assert feature.low <= values.min()
@@ -100,7 +101,7 @@ def test_values_of_features_stay_within_their_bounds(base):
 
 
 def test_where_nobody_has_a_choice_nothing_is_tilted(base):
-    dist = distribution_of(CalibratedPolicy(base, NAMES, ETA), SCENES[0])
+    dist = distribution_of(CalibratedTokenPolicy(base, NAMES, ETA), SCENES[0])
     certain = replace(dist.base, logits=20 * torch.nn.functional.one_hot(dist.logits.argmax(-1), 48).float())
     tilted = replace(dist, base=certain)
     assert torch.equal(tilted.logits, certain.logits)
@@ -108,7 +109,7 @@ def test_where_nobody_has_a_choice_nothing_is_tilted(base):
 
 
 def test_a_scene_without_any_map_has_no_edge_and_no_lane(base):
-    candidates = distribution_of(CalibratedPolicy(base, NAMES), scenes.without_map())._candidates
+    candidates = distribution_of(CalibratedTokenPolicy(base, NAMES), scenes.without_map())._candidates
     assert len(candidates.row)
     for values in (candidates.road_edge(0.5), candidates.lane_turn, candidates.lane_offset):
         assert not values.any()
@@ -125,7 +126,7 @@ def test_what_all_candidates_share_changes_nothing(base):
     # a vehicle that leaves the road with every token it may take: the tokens it would never take are no way out
     register_feature("off_the_road", low=0.0, high=3.0)(lambda candidates: torch.full_like(candidates.log_ratio, 3.0))
     try:
-        dist = distribution_of(CalibratedPolicy(base, ["off_the_road"], [-2.6]), SCENES[0])
+        dist = distribution_of(CalibratedTokenPolicy(base, ["off_the_road"], [-2.6]), SCENES[0])
         assert torch.equal(dist.logits, dist.base.logits)
         assert not dist.values.any()
     finally:
@@ -133,7 +134,7 @@ def test_what_all_candidates_share_changes_nothing(base):
 
 
 def test_a_road_edge_is_that_of_the_way_ahead_and_braking_is_no_way_from_it(base):
-    candidates = distribution_of(CalibratedPolicy(base, NAMES), SCENES[0])._candidates
+    candidates = distribution_of(CalibratedTokenPolicy(base, NAMES), SCENES[0])._candidates
     straight = candidates.end[:, 1].abs() < 0.02
     for seconds in (0.5, 1.0):
         nearness = candidates.road_edge(seconds)
@@ -145,7 +146,7 @@ def test_a_road_edge_is_that_of_the_way_ahead_and_braking_is_no_way_from_it(base
 
 def test_a_feature_shifts_logits_by_eta_times_its_value_and_only_those_of_candidates(base):
     name = "speed_fast"
-    dist = distribution_of(CalibratedPolicy(base, [name], [0.5]), SCENES[0])
+    dist = distribution_of(CalibratedTokenPolicy(base, [name], [0.5]), SCENES[0])
     shift = dist.logits - dist.base.logits
     candidates = torch.zeros_like(shift, dtype=torch.bool)
     candidates[dist._pairs[:2]] = True
@@ -165,7 +166,7 @@ def test_it_is_saved_and_loaded_with_its_base(calibrated, tmp_path):
     calibrated.set_calibration(calibrated.eta.detach(), fitted)
     calibrated.save_pretrained(tmp_path, card="made by hand")
     loaded = load_policy(tmp_path)
-    assert isinstance(loaded, CalibratedPolicy)
+    assert isinstance(loaded, CalibratedTokenPolicy)
     assert loaded.calibration == fitted
     assert fingerprint_policy(loaded) == fingerprint_policy(calibrated)
     batch = collate([SCENES[0]])
@@ -184,17 +185,19 @@ def test_a_folder_without_finite_weights_is_refused(calibrated, tmp_path):
 def test_settings_of_the_base_count_in_the_fingerprint(base):
     other = copy.deepcopy(base)
     other.config = tiny.replace(base.config, agent_radius_m=base.config.agent_radius_m + 1)
-    assert fingerprint_policy(CalibratedPolicy(base, NAMES)) != fingerprint_policy(CalibratedPolicy(other, NAMES))
+    assert fingerprint_policy(CalibratedTokenPolicy(base, NAMES)) != fingerprint_policy(
+        CalibratedTokenPolicy(other, NAMES)
+    )
 
 
 def test_the_mean_of_two_calibrations_has_the_mean_eta(base):
-    low, high = (CalibratedPolicy(base, NAMES[:2], eta) for eta in ([0.0, 1.0], [1.0, 3.0]))
+    low, high = (CalibratedTokenPolicy(base, NAMES[:2], eta) for eta in ([0.0, 1.0], [1.0, 3.0]))
     assert average_policies([low, high]).eta.tolist() == [0.5, 2.0]
 
 
 def test_averages_are_of_policies_with_the_same_features(base):
     with pytest.raises(ConfigError, match="differs from the first"):
-        average_policies([CalibratedPolicy(base, NAMES[:2]), CalibratedPolicy(base, NAMES[1:3])])
+        average_policies([CalibratedTokenPolicy(base, NAMES[:2]), CalibratedTokenPolicy(base, NAMES[1:3])])
 
 
 def test_half_precision_coarsens_the_base_and_not_the_tilt(calibrated):
@@ -220,10 +223,10 @@ def test_further_training_moves_the_base_below_a_fixed_eta(calibrated):
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (lambda base: CalibratedPolicy(ConstantVelocity(), NAMES), "ConstantVelocity has no weights"),
-        (lambda base: CalibratedPolicy(base, ["speed_slw"]), "did you mean 'speed_slow'"),
-        (lambda base: CalibratedPolicy(base, ["speed_slow"] * 2), "different names"),
-        (lambda base: CalibratedPolicy(base, NAMES, [1.0]), "one for each"),
+        (lambda base: CalibratedTokenPolicy(ConstantVelocity(), NAMES), "ConstantVelocity has no weights"),
+        (lambda base: CalibratedTokenPolicy(base, ["speed_slw"]), "did you mean 'speed_slow'"),
+        (lambda base: CalibratedTokenPolicy(base, ["speed_slow"] * 2), "different names"),
+        (lambda base: CalibratedTokenPolicy(base, NAMES, [1.0]), "one for each"),
         (lambda base: register_feature("wide", low=1.0, high=-1.0), "low < high"),
     ],
 )
@@ -237,12 +240,12 @@ def test_a_feature_of_ones_own_works_by_its_name_and_its_shape_is_checked(base):
     register_feature("by_agent", low=-1.0, high=1.0)(lambda c: c.speed)
     try:
         half, whole = (
-            distribution_of(CalibratedPolicy(base, [name]), SCENES[0]) for name in ("half_speed", "speed_fast")
+            distribution_of(CalibratedTokenPolicy(base, [name]), SCENES[0]) for name in ("half_speed", "speed_fast")
         )
         is_fast = whole.values[:, 0] != 0
         torch.testing.assert_close(half.values[is_fast, 0], 0.5 * whole.values[is_fast, 0])
         with pytest.raises(ConfigError, match="a number for each"):
-            distribution_of(CalibratedPolicy(base, ["by_agent"], [1.0]), SCENES[0])
+            distribution_of(CalibratedTokenPolicy(base, ["by_agent"], [1.0]), SCENES[0])
     finally:
         FEATURES.remove("half_speed")
         FEATURES.remove("by_agent")
@@ -262,7 +265,7 @@ def plugged_in(request):
     indirect=True,
 )
 def test_a_feature_may_give_numbers_of_any_type(base, plugged_in):
-    logits = distribution_of(CalibratedPolicy(base, plugged_in, [1.0]), SCENES[0]).logits
+    logits = distribution_of(CalibratedTokenPolicy(base, plugged_in, [1.0]), SCENES[0]).logits
     assert logits.dtype == torch.float32
     assert not torch.equal(logits, distribution_of(base, SCENES[0]).logits)
 
@@ -270,14 +273,14 @@ def test_a_feature_may_give_numbers_of_any_type(base, plugged_in):
 @pytest.mark.parametrize("plugged_in", [lambda c: c.log_ratio / 0.0], indirect=True)  # -inf is clipped, 0 / 0 is not
 def test_a_feature_that_gives_nan_is_refused_by_its_name(base, plugged_in):
     with pytest.raises(ConfigError, match="feature 'plugged_in' gives NaN for"):
-        distribution_of(CalibratedPolicy(base, plugged_in, [1.0]), SCENES[0])
+        distribution_of(CalibratedTokenPolicy(base, plugged_in, [1.0]), SCENES[0])
 
 
 @pytest.mark.parametrize("plugged_in", [lambda c: c.speed_change], indirect=True)
 def test_a_model_whose_feature_is_of_a_missing_package_says_so(base, plugged_in, tmp_path):
-    CalibratedPolicy(base, plugged_in).save_pretrained(tmp_path)
+    CalibratedTokenPolicy(base, plugged_in).save_pretrained(tmp_path)
     FEATURES.remove("plugged_in")
-    reason = r"do not fit CalibratedPolicy \(unknown feature 'plugged_in': .* once that is installed or imported"
+    reason = r"do not fit CalibratedTokenPolicy \(unknown feature 'plugged_in': .* once that is installed or imported"
     with pytest.raises(CheckpointError, match=reason):
         load_policy(tmp_path)
 
@@ -293,7 +296,7 @@ def calibrated_runs(base, *settings):
             "num_scenarios": [8, 2], "num_rollouts": 8, "constraints": ["speed"], "length": 0.7, "features": [row],
             "held_back": [held_back],
         }  # fmt: skip
-        runs.append(CalibratedPolicy(base, ["speed_fast"], [eta], account | changes))
+        runs.append(CalibratedTokenPolicy(base, ["speed_fast"], [eta], account | changes))
     return runs
 
 

@@ -3,7 +3,7 @@
 A token is a candidate if more than `exp(-SUPPORT_NATS)` times as likely as the likeliest token. All further tokens
 together have next to no probability, and are fifty times as many. Features fade in over the least likely candidates, so
 that a token just above the limit is as good as a token just below. Agents with a single candidate, such as parked cars,
-have no choice and are left out.
+have no choice and are left out. Where decisions are continuous, actions take the place of tokens: `calibrated.actions`.
 
 Candidates are read off a scene: the agents of several scenarios before each decision, and the lanes and edges of the
 roads.
@@ -239,7 +239,7 @@ class Candidates:
     log_ratio: Float[Tensor, "P"]
     """Log of the token's probability over that of the agent's likeliest token, in the policy that is calibrated."""
     seconds: float
-    """Duration of a decision."""
+    """Duration of a token."""
     _memo: dict[tuple[str, float], Tensor] = field(default_factory=dict)
     """Overlaps and edges by time, which several features read."""
 

@@ -4,9 +4,9 @@
     def braking(candidates: Candidates) -> Float[Tensor, "P"]:
         return candidates.speed_change * candidates.where(candidates.is_vehicle)
 
-A feature is a function on tensors, of all pairs of agents and tokens at once, and has bounds, to which values are
-clipped: without bounds rare tokens with an extreme value would win. A feature is computed before the decision, and
-may not read the logged future. A separate package announces features as entry points:
+A feature is a function on tensors, of all pairs of agents and tokens at once (or actions, see `calibrated.actions`),
+and has bounds, to which values are clipped: without bounds rare tokens with an extreme value would win. A feature is
+computed before the decision, and may not read the logged future. A separate package announces features as entry points:
 
     [project.entry-points."rlftsim.features"]
     braking = "my_package.features:braking"
@@ -16,7 +16,7 @@ R elements, P pairs of an element and a candidate token, K features, V tokens.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -210,6 +210,14 @@ class TiltedDistribution(CategoricalDistribution):
     def values(self) -> Float[Tensor, "P K"]:
         """Features of all candidates, as the tilt is made of them: see `_relate`."""
         return self._relate(torch.stack([feature(self._candidates) for feature in self.features], -1))
+
+    def with_eta(self, eta: Float[Tensor, "K"]) -> "TiltedDistribution":
+        """The distribution of the same base with other weights.
+
+        Args:
+            eta: Weights of the features.
+        """
+        return replace(self, eta=eta)
 
     def score_function(self, decision: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
         """Gradient of the decisions' log-probability by eta: the features of the chosen token minus the mean of all.

@@ -1,4 +1,4 @@
-"""A policy with a vocabulary, calibrated: eta · f(state, token) on the logits, with named features f.
+"""A policy, calibrated: eta · f(state, decision) on its log-probabilities, with named features f.
 
 A model folder has a `calibration.json`: weight and gain of each feature, and the changes on the scenarios held back.
 
@@ -7,10 +7,11 @@ B scenarios, N rollouts, A agents, L decisions, K features.
 
 import json
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -19,17 +20,18 @@ from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import write_text
+from rlftsim.policies.calibrated.actions import ShiftedDistribution, Slopes
 from rlftsim.policies.calibrated.candidates import Scene, Traffic, build_scene, join_moments
 from rlftsim.policies.calibrated.features import TiltedDistribution, features_by_name
 from rlftsim.policies.checkpoint import read_model, save_model
-from rlftsim.policies.distributions import CategoricalDistribution
 from rlftsim.policies.registry import load_policy
-from rlftsim.rollout.policy import TokenPolicy, relight
+from rlftsim.rollout.policy import ActionPolicy, TokenPolicy, relight
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import STEP_S
 from rlftsim.tokens.vocabulary import Vocabulary
 
+Model = TypeVar("Model", bound="CalibratedPolicy")
 CHANGES = {
     "rmm": ("RMM", "+.4f"),
     "kinematic": ("kinematic", "+.4f"),
@@ -45,7 +47,8 @@ BASE = "base"
 CALIBRATION = "calibration.json"
 """How eta was fitted and what each feature earns."""
 PASSED_ON = (
-    *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced", "sampling"),
+    *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced", "imitation_loss"),
+    "sampling",
 )
 """Attributes that a calibrated policy passes on from the base, if the base has these."""
 
@@ -132,7 +135,9 @@ def _count(number: int | None, noun: str) -> str:
     return f"{'different numbers of' if number is None else number} {noun}{'' if number == 1 else 's'}"
 
 
-def _with_t(change: Mapping[str, float], style: str) -> str:
+def _with_t(change: Mapping[str, float | None], style: str) -> str:
+    if change["change"] is None:
+        return "–"
     t = _format_t(change["t"])
     return f"{change['change']:{style}}" + (f" ({t})" if t else "")
 
@@ -183,20 +188,22 @@ class State:
         return self.traffic.heading[..., 0]
 
 
-class CalibratedPolicy(nn.Module):
-    """A `TokenPolicy` with eta · f(state, token) added to the token logits.
+class CalibratedPolicy(nn.Module, ABC):
+    """A policy with eta · f(state, decision) added to its log-probabilities, whatever its decisions are.
 
     Log-probabilities, KL and entropy are those of the tilted distribution. Further training changes the weights of the
     base below a fixed eta; imitation of the log without a rollout (`teacher_forced`) sees the base alone.
 
     Args:
-        base: Policy with a vocabulary and weights, which is calibrated.
+        base: Policy with weights, which is calibrated.
         features: Names of registered features, each at most once.
         eta: Weights of the features; None = zeros, with which the decisions are those of the base, bit for bit.
         calibration: Account of how eta was fitted, stored with the weights; see `training.calibrate`.
     """
 
-    architecture = "calibrated"
+    architecture: ClassVar[str]
+    base_protocol: ClassVar[type]
+    """Protocol that a base has to keep."""
     fingerprint_parts = ("base",)
 
     def __init__(
@@ -208,8 +215,11 @@ class CalibratedPolicy(nn.Module):
     ):
         if not isinstance(base, nn.Module):
             raise ConfigError(f"{type(base).__name__} has no weights: there is nothing to calibrate.")
-        if not isinstance(base, TokenPolicy):
-            raise ConfigError(f"{type(base).__name__} has no vocabulary to calibrate: fine-tune by rlft.")
+        if not isinstance(base, self.base_protocol):
+            raise ConfigError(
+                f"{type(base).__name__} is no {self.base_protocol.__name__}, which a {type(self).__name__} is made of: "
+                "add_features finds what fits a policy."
+            )
         super().__init__()
         self.base: Any = base
         self.features = tuple(features)
@@ -226,12 +236,7 @@ class CalibratedPolicy(nn.Module):
     def __getattr__(self, name: str) -> Any:
         return getattr(super().__getattr__("base"), name) if name in PASSED_ON else super().__getattr__(name)
 
-    # what every `TokenPolicy` has; from Python 3.12 on isinstance sees none of the attributes of `__getattr__`
-
-    @property
-    def vocabulary(self) -> Vocabulary:
-        """Tokens of the base."""
-        return self.base.vocabulary
+    # what every `Policy` has; from Python 3.12 on isinstance sees none of the attributes of `__getattr__`
 
     @property
     def steps_per_decision(self) -> int:
@@ -249,7 +254,7 @@ class CalibratedPolicy(nn.Module):
         return self.base.initial_noise_size
 
     def __repr__(self) -> str:
-        return f"CalibratedPolicy({self.base!r}, {len(self.features)} features)"
+        return f"{type(self).__name__}({self.base!r}, {len(self.features)} features)"
 
     @property
     def calibration(self) -> dict[str, Any]:
@@ -299,8 +304,8 @@ class CalibratedPolicy(nn.Module):
         base = self.base.begin(context.base, num_rollouts, goals, noise)
         return State(base, context.scene.begin(num_rollouts))
 
-    def decide(self, context: Context, state: State) -> TiltedDistribution:
-        """Tilted distributions [B, N, A] of the next token.
+    def decide(self, context: Context, state: State) -> Any:
+        """Tilted distributions [B, N, A] of the next decision.
 
         Args:
             context: Result of `encode` for the scenarios.
@@ -314,13 +319,13 @@ class CalibratedPolicy(nn.Module):
         Args:
             context: Result of `encode` for the scenarios.
             state: State before the decision, which stays as it is.
-            decision: Token ids [B, N, A] that the agents take.
+            decision: Decisions [B, N, A, *event] that the agents take.
             forced: States [B, N, A, t] imposed from outside, as for the base.
         """
         base = self.base.advance(context.base, state.base, decision, forced)
         return State(base, state.traffic.advance(base.poses, self._seconds))
 
-    def score(self, context: Context, rollouts: Rollouts) -> CategoricalDistribution:
+    def score(self, context: Context, rollouts: Rollouts) -> Any:
         """Tilted distributions [B, N, A, L] along rollouts.
 
         Args:
@@ -366,7 +371,7 @@ class CalibratedPolicy(nn.Module):
         return self._with_base(self.base.with_guidance(scale))
 
     def _with_base(self, base: Any) -> "CalibratedPolicy":
-        return CalibratedPolicy(base, self.features, self.eta.tolist(), self._calibration).to(self.eta.device)
+        return type(self)(base, self.features, self.eta.tolist(), self._calibration).to(self.eta.device)
 
     # ---- files ----------------------------------------------------------------------------------------------------
 
@@ -385,7 +390,7 @@ class CalibratedPolicy(nn.Module):
         save_model(folder, self, {"features": self.features}, card=card, weights={"eta": self.eta.detach()})
 
     @classmethod
-    def from_pretrained(cls, folder: str | os.PathLike) -> "CalibratedPolicy":
+    def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
         """Policy of a model folder as written by `save_pretrained`.
 
         Raises:
@@ -409,6 +414,62 @@ class CalibratedPolicy(nn.Module):
         """Duration of a decision."""
         return self.steps_per_decision * STEP_S
 
+    @abstractmethod
+    def _tilt(self, scene: Scene, dist: Any, traffic: Traffic) -> Any:
+        """The distribution of the base with the features, in a scene with some traffic."""
+
+
+class CalibratedTokenPolicy(CalibratedPolicy):
+    """A `TokenPolicy` with eta · f(state, token) added to the token logits."""
+
+    architecture, base_protocol = "calibrated", TokenPolicy
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """Tokens of the base."""
+        return self.base.vocabulary
+
     def _tilt(self, scene: Scene, dist: Any, traffic: Traffic) -> TiltedDistribution:
         values = (self.eta, self._features, scene, traffic, self.vocabulary, self._seconds)
         return TiltedDistribution(dist, dist.mask, *values, dist.sampling)
+
+
+class CalibratedActionPolicy(CalibratedPolicy):
+    """An `ActionPolicy` with mean actions that eta · f shifts, see `policies.calibrated.actions`."""
+
+    architecture, base_protocol = "calibrated-actions", ActionPolicy
+
+    def predict_pose(self, class_id: Tensor, speed: Tensor, action: Tensor, seconds: float) -> Tensor:
+        """Where an action leads, as the base says.
+
+        Args:
+            class_id: Classes of the agents.
+            speed: Speeds of the agents, m/s.
+            action: Actions of the agents.
+            seconds: Time from now.
+        """
+        return self.base.predict_pose(class_id, speed, action, seconds)
+
+    def _tilt(self, scene: Scene, dist: Any, traffic: Traffic) -> ShiftedDistribution:
+        slopes = Slopes(dist, self._features, scene, traffic, self.predict_pose, self._seconds)
+        return slopes.shift(self.eta)
+
+
+def add_features(policy: Any, features: Sequence[str]) -> CalibratedPolicy:
+    """A policy with features of weight 0; unchanged where a model has the same features already.
+
+    Args:
+        policy: Policy whose decisions are tokens, or actions that lead somewhere (`ActionPolicy`).
+        features: Names of registered features, each at most once.
+
+    Raises:
+        ConfigError: No such policy, no weights, or an unknown feature.
+    """
+    if isinstance(policy, CalibratedPolicy) and policy.features == tuple(features):
+        return policy
+    if isinstance(policy, nn.Module) and not isinstance(policy, TokenPolicy | ActionPolicy):
+        raise ConfigError(
+            f"{type(policy).__name__} has neither a vocabulary nor predict_pose (rollout.policy.ActionPolicy), so no "
+            "feature says what a decision leads to: fine-tune it by rlft."
+        )
+    return (CalibratedTokenPolicy if isinstance(policy, TokenPolicy) else CalibratedActionPolicy)(policy, features)

@@ -5,7 +5,7 @@ scores of a model.
 """
 
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.policies.calibrated.policy import CALIBRATION, CalibratedPolicy, read_calibration
+from rlftsim.policies.calibrated.policy import CALIBRATION, CalibratedTokenPolicy, read_calibration
 from rlftsim.policies.checkpoint import SHIPPED_MODELS, load_strictly
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
@@ -16,16 +16,16 @@ def demo_base() -> SmartPolicy:
     return SmartPolicy.from_pretrained(SHIPPED_MODELS / "demo-base")
 
 
-def demo_tuned() -> CalibratedPolicy:
+def demo_tuned() -> CalibratedTokenPolicy:
     """demo-base after MLOO that holds speed and a calibration: half of the collisions, at the same driving speed."""
     calibration = read_calibration(SHIPPED_MODELS / "demo-tuned" / CALIBRATION)
     features, eta = zip(*((row["feature"], row["eta"]) for row in calibration["features"]))
-    return CalibratedPolicy(_with_changes(demo_base(), "demo-tuned"), features, eta, calibration)
+    return CalibratedTokenPolicy(_with_changes(demo_base(), "demo-tuned"), features, eta, calibration)
 
 
-def demo_fast() -> CalibratedPolicy:
+def demo_fast() -> CalibratedTokenPolicy:
     """A student of demo-tuned, a seventh of the weights: rollouts in a quarter of the time, 0.009 less realistic."""
-    return CalibratedPolicy.from_pretrained(SHIPPED_MODELS / "demo-fast")
+    return CalibratedTokenPolicy.from_pretrained(SHIPPED_MODELS / "demo-fast")
 
 
 def demo_goals() -> SmartPolicy:

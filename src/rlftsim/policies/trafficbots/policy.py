@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.goals.types import Goals
@@ -32,6 +32,7 @@ from rlftsim.policies.trafficbots.state import (
     compute_imposed_states,
     join_history,
     max_action,
+    move,
     start_traffic,
 )
 from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
@@ -211,6 +212,20 @@ class TrafficBotsPolicy(nn.Module):
             ref_dist = reference._score_states(ref_context, replay, rollouts.decision, features)
         return self._score_states(context, replay, rollouts.decision, features), ref_dist
 
+    def predict_pose(
+        self, class_id: Int64[Tensor, "*#g"], speed: Float[Tensor, "*#g"], action: Float[Tensor, "*g 2"], seconds: float
+    ) -> Float[Tensor, "*g 3"]:
+        """Where an action leads that is kept up: x, y and heading in the agent's frame.
+
+        Args:
+            class_id: 0 vehicle, 1 pedestrian, 2 cyclist.
+            speed: Speeds of the agents, m/s, negative backwards.
+            action: Actions before tanh: acceleration and yaw rate.
+            seconds: Time from now.
+        """
+        start = action.new_zeros(*action.shape[:-1], 3)
+        return move(start, speed.expand(action.shape[:-1]), action, max_action(class_id), seconds)[0]
+
     def encode_scene(self, scene: Scene) -> Context:
         """Features of the map, and of the lights at all decisions.
 
@@ -359,9 +374,9 @@ class TrafficBotsPolicy(nn.Module):
         shape = (len(agent_class), 1, agent_class.shape[1], *[1] * (mean.dim() - 4), 2)
         std = self.noise_std[agent_class].view(shape).expand_as(mean)
         rho = self.config.noise_correlation
-        mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
+        noisy_mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
         std = torch.where(continues[..., None], std * math.sqrt(1 - rho**2), std)
-        return GaussianDistribution(mean, std, alive)
+        return GaussianDistribution(noisy_mean, std, alive, aim=mean)
 
     # ---- files ----------------------------------------------------------------------------------------------------
 

@@ -34,22 +34,24 @@ def move(
     speed: Float[Tensor, "*g"],
     action: Float[Tensor, "*g 2"],
     limit: Float[Tensor, "*#g 2"],
+    seconds: float = STEP_S,
 ) -> tuple[Float[Tensor, "*g 3"], Float[Tensor, "*g 3"]]:
-    """Pose and motion (speed, acceleration, yaw rate) after 0.1 s.
+    """Pose and motion (speed, acceleration, yaw rate) after an action.
 
     Args:
         pose: Poses before the step.
         speed: Speeds before the step, negative backwards, m/s.
         action: Actions before tanh, as the network returns.
         limit: Largest actions of the agents, from `max_action`.
+        seconds: Duration of the action.
     """
     acceleration, yaw_rate = (limit * action.tanh()).unbind(-1)
     # Midpoint rule: speed and heading in the middle of the step.
-    distance = (speed + acceleration * (STEP_S / 2)) * STEP_S
+    distance = (speed + acceleration * (seconds / 2)) * seconds
     heading = pose[..., 2]
-    position = pose[..., :2] + distance[..., None] * heading_vector(heading + yaw_rate * (STEP_S / 2))
-    moved = torch.cat([position, (heading + yaw_rate * STEP_S)[..., None]], -1)
-    return moved, torch.stack([speed + acceleration * STEP_S, acceleration, yaw_rate], -1)
+    position = pose[..., :2] + distance[..., None] * heading_vector(heading + yaw_rate * (seconds / 2))
+    moved = torch.cat([position, (heading + yaw_rate * seconds)[..., None]], -1)
+    return moved, torch.stack([speed + acceleration * seconds, acceleration, yaw_rate], -1)
 
 
 def reaches_destination(
