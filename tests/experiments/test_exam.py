@@ -3,6 +3,7 @@
 import json
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -163,6 +164,11 @@ def test_a_line_that_is_none_of_a_ledger_is_named(tmp_path):
     )
     with pytest.raises(DataError, match="line 2 is none of a ledger"):
         Ledger(tmp_path / "exam.jsonl").count_looks("a", "r", [], is_repeat=True)
+
+
+def test_the_ledger_of_this_repository_takes_further_looks():
+    ledger = Ledger(Path(__file__).parents[2] / "benchmarks" / "exam.jsonl")
+    assert ledger.count_looks("synthetic-200-2415932249", "demo-fast", [], is_repeat=True) == 1
 
 
 @pytest.mark.slow
