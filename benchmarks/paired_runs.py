@@ -6,8 +6,8 @@ for seed in 1 2 3 4 5; do
 done
 python benchmarks/paired_runs.py --base runs/*-?/evaluations/base.parquet --tuned runs/*-?/evaluations/fine-tuned.parquet
 
-Evaluations of the bases and, in the same order, of what was made from each. Intervals are over street networks or logs,
-of all runs together over these and runs. Markdown.
+Evaluations of the bases (or of a single one) and, in the same order, of what was made from each. Intervals are over
+street networks or logs, of all runs together over these and runs. Markdown.
 """
 
 import argparse
@@ -32,7 +32,8 @@ def main() -> None:
     parser.add_argument("--base", nargs="+", type=Path, required=True)
     parser.add_argument("--tuned", nargs="+", type=Path, required=True)
     options = parser.parse_args()
-    row = ExamRow("tuned", (), *([Evaluation.read(path) for path in paths] for paths in (options.tuned, options.base)))
+    bases = options.base * len(options.tuned) if len(options.base) == 1 else options.base
+    row = ExamRow("tuned", (), *([Evaluation.read(path) for path in paths] for paths in (options.tuned, bases)))
     print("| run | base | tuned | RMM | p |\n|---|--:|--:|--:|--:|")
     for path, before, after in zip(options.tuned, row.references, row.by_run, strict=True):
         change = ExamRow("tuned", (), [after], [before]).change(RMM)
