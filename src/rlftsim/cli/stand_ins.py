@@ -20,6 +20,7 @@ ENGINES = (
     *("policies.smart.policy", "policies.trafficbots.policy", "evaluation.learning_curve", "rollout.simulate"),
     *("training.trackers", "evaluation.evaluate", "evaluation.compare", "evaluation.explain_page", "recipes.train"),
     *("evaluation.scenario_source", "evaluation.rollout_files", "evaluation.resumable", "scenario.inspect"),
+    "policies.calibrated.policy",
 )
 """Modules of this package that do the work, and have no setting and no flag."""
 SLOW = (
