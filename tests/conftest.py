@@ -22,6 +22,10 @@ type_checks.remember_checks()
 # pytest-xdist sets the width of its own terminal
 os.environ.pop("COLUMNS", None)
 
+# Servers of a test leave grpc's threads behind. Revived in a worker that another test forks, they close files of it, so
+# that ffmpeg's pipe broke. No worker speaks grpc.
+os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
+
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
 settings.load_profile("rlftsim")
