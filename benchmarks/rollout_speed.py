@@ -16,7 +16,7 @@ from tyro.conf import Positional
 
 import rlftsim as rs
 from rlftsim.jobs.threads import keep_freed_memory
-from rlftsim.policies.calibrated.policy import CalibratedTokenPolicy
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import frozen_copy
 from rlftsim.rollout.simulate import simulate
@@ -54,7 +54,7 @@ def main(
     policies = {}
     for model in models:
         policy = frozen_copy(load_policy(model))
-        policies |= {f"{model}, base": policy.base} if isinstance(policy, CalibratedTokenPolicy) else {}
+        policies |= {f"{model}, base": policy.base} if isinstance(policy, CalibratedPolicy) else {}
         policies[model] = policy
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in policies}
     for seed in range(repetitions + 1):

@@ -4,6 +4,7 @@ python tests/tiny.py pretrain|catk|finetune|everything OUT [--processes 2] [--up
 """
 
 import argparse
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from safetensors.torch import save_file
 
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
@@ -91,6 +93,23 @@ def tiny_policy(vocabulary, config=MODEL, seed=3):
 def gradients_of(policy):
     """What the last update left in the parameters."""
     return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+
+
+def check_score_function(calibrated, batch, step=1e-2):
+    """Distribution along rollouts and its score function, which is that of differences of eta."""
+    rollouts = simulate(calibrated, batch, num_rollouts=2, seed=0)
+    dist = calibrated.score(calibrated.encode(batch), rollouts)
+    gradient = dist.score_function(rollouts.decision)
+    for index in range(len(calibrated.features)):
+        ends = []
+        for sign in (1, -1):
+            moved = copy.deepcopy(calibrated)
+            with torch.no_grad():
+                moved.eta[index] += sign * step
+            ends.append(moved.score(moved.encode(batch), rollouts).log_prob(rollouts.decision))
+        difference = (ends[0] - ends[1]) / (2 * step)
+        torch.testing.assert_close(gradient[..., index], difference, atol=2e-3, rtol=1e-2)
+    return dist, gradient
 
 
 def train(stage, policy, scenarios, out, held_out=None, **changes):

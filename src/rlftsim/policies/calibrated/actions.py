@@ -91,8 +91,8 @@ class Slopes:
                 f"predict_pose gives {shape} for actions {list(action.shape)}: return x, y and heading of each, finite "
                 f"numbers {[count, 2 * size, 3]}."
             )
-        ratio = (aim / std).repeat(1, 2)
-        log_ratio = torch.where(sides.sum(-1) < 0, -ratio, ratio) - ratio.abs()  # of the likelier side 0
+        ratio = (aim / std).repeat(1, 2) * sides.sum(-1)
+        log_ratio = ratio - ratio.abs()  # of the likelier side 0
         return Candidates(
             self.scene,
             # the turn of a decision, as if it had lasted as long as the look ahead
